@@ -1,0 +1,456 @@
+"""base_approach: on a unicycle with limits, lag, delay and noise it arrives, stays off the panel, and fails honestly."""
+
+import dataclasses as dc
+
+import numpy as np
+import pytest
+from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+
+from valve_drake.behaviors import valve_search
+from valve_drake.behaviors.base_approach import BaseApproachConfig, Memory, Track, step
+from valve_drake.behaviors.base_approach_system import BaseApproachSystem
+from valve_drake.checks import ConfigError
+from valve_drake.frames import apply, inverse, make, rot_z, wrap
+from valve_drake.kinematics import RobotGeometry
+from valve_drake.messages import (
+    Command,
+    Mode,
+    ModeState,
+    RectangleEstimate,
+    RobotState,
+    Stance,
+    Status,
+    StereoPosition,
+    Verdict,
+)
+
+DT = 1 / 64  # half the real rate: the laws do not depend on it, and the tests are quicker
+CONFIG = BaseApproachConfig()
+STANCE_DISTANCE = 0.72 - CONFIG.panel_behind  # base to marker plane
+
+
+@dc.dataclass
+class Wheels:
+    """A differential drive: the command arrives two ticks late, is followed with a lag, within acceleration limits."""
+
+    pose: np.ndarray  # x, y, heading
+    twist: np.ndarray = dc.field(default_factory=lambda: np.zeros(2))
+    queue: list = dc.field(default_factory=lambda: [np.zeros(2)] * 2)
+
+    def drive(self, command: np.ndarray) -> None:
+        self.queue.append(command)
+        wanted = self.queue.pop(0)
+        self.twist = self.twist + np.clip((wanted - self.twist) / 0.08, [-1.0, -2.5], [1.0, 2.5]) * DT
+        v, w = self.twist
+        middle = self.pose[2] + w * DT / 2
+        self.pose = self.pose + DT * np.array([v * np.cos(middle), v * np.sin(middle), w])
+
+
+@dc.dataclass
+class Scene:
+    """A marker at `marker` (x, y, heading of the normal into the panel); what stages 1 to 3 say of it 8 times a second."""
+
+    marker: np.ndarray
+    rng: np.random.Generator
+    noise: float = 1.0
+
+    def stance(self) -> np.ndarray:
+        x, y, h = self.marker
+        return np.array([x - STANCE_DISTANCE * np.cos(h), y - STANCE_DISTANCE * np.sin(h), h])
+
+    def clear(self, pose: np.ndarray) -> float:
+        """Base centre to the panel's plane."""
+        h = self.marker[2]
+        return float((self.marker[:2] - pose[:2]) @ [np.cos(h), np.sin(h)]) + CONFIG.panel_behind
+
+    def look(self, time: float, pose: np.ndarray) -> tuple[StereoPosition, RectangleEstimate, Stance]:
+        far = np.hypot(*(self.marker - pose)[:2]) * self.noise
+        shift = self.rng.normal(size=3) * np.array([0.003, 0.003, np.deg2rad(0.4)]) * far
+        x, y, h = self.marker + shift
+        normal = np.array([np.cos(h), np.sin(h), 0.0])
+        R = np.column_stack([np.cross([0.0, 0, -1], normal), [0.0, 0, -1], normal])
+        seen = Scene(self.marker + shift, self.rng)
+        return (
+            StereoPosition(time=time, found=True, p_LV=np.array([x, y, 1.0]), covariance=np.eye(3) * 1e-4),
+            RectangleEstimate(time=time, found=True, X_LV=make(R, np.array([x, y, 1.0]))),
+            Stance(time=time, found=True, base=seen.stance(), margin=0.5),
+        )
+
+
+@dc.dataclass
+class Run:
+    status: Status
+    time: float
+    poses: np.ndarray  # (n, 3)
+    twists: np.ndarray  # commanded (n, 2)
+    details: set
+
+
+def drive(mode, wheels, scene, *, limit=40.0, config=CONFIG, alter=None, arms=None, visible=None, watch=None):
+    """Runs one activation until it ends -> Run.
+
+    alter(t, messages) changes what is seen, visible() says whether anything is, arms(t) is a joint speed,
+    watch(robot_state, mode, messages) is called each tick.
+    """
+    memory, poses, twists, details = Memory(), [], [], set()
+    seen = (StereoPosition(), RectangleEstimate(), Stance())
+    state = ModeState(mode=mode.value, activation=3)
+    for k in range(int(limit / DT)):
+        t = k * DT
+        if k % 8 == 4 and (visible is None or visible()):
+            seen = scene.look(t, wheels.pose)
+            seen = alter(t, seen) if alter else seen
+        odometry = np.concatenate([wheels.pose, wheels.twist])
+        if scene.noise:
+            odometry[:3] += scene.rng.normal(size=3) * np.array([3e-4, 3e-4, 3e-4])
+        robot = RobotState(time=t, odometry=odometry, left_arm_velocity=np.full(6, arms(t) if arms else 0.0))
+        if watch:
+            watch(robot, state, seen)
+        memory, command, status = step(config, memory, t, DT, robot, state, *seen)
+        wheels.drive(command.base_twist)
+        poses.append(wheels.pose)
+        twists.append(command.base_twist)
+        details.add(status.detail.split(":")[0])
+        if status.state != "running":
+            break
+    assert status.activation == 3
+    return Run(status, t, np.array(poses), np.array(twists), details)
+
+
+def place(scene: Scene, bearing: float, distance: float, off: float = 0.0) -> np.ndarray:
+    """A base at `distance` from the marker, `bearing` from its normal, looking at it but for `off`."""
+    x, y, h = scene.marker
+    towards = h + bearing
+    return np.array([x - distance * np.cos(towards), y - distance * np.sin(towards), wrap(towards + off)])
+
+
+def random_scene(rng) -> Scene:
+    return Scene(np.array([*rng.uniform(-3, 3, 2), rng.uniform(-np.pi, np.pi)]), rng)
+
+
+def assert_arrived(run: Run, scene: Scene) -> None:
+    assert run.status.state == "succeeded", run.status.detail
+    error = run.poses[-1] - scene.stance()
+    assert np.hypot(*error[:2]) < 0.020  # tolerance, and the noise of the stance itself
+    assert abs(wrap(error[2])) < np.deg2rad(1.4)
+
+
+def assert_clear(run: Run, scene: Scene, start: np.ndarray) -> None:
+    """Never nearer than the clearance; a start that is nearer may only move away."""
+    nearest = min(scene.clear(start), CONFIG.clearance)
+    assert min(scene.clear(p) for p in run.poses) > nearest - 0.001
+
+
+# ---------------------------------------------------------------- fine approach
+
+
+def test_fine_approach_arrives_from_50_random_starts_within_30_s_and_off_the_panel():
+    rng = np.random.default_rng(5)
+    times = []
+    for _ in range(50):
+        scene = random_scene(rng)
+        start = place(scene, rng.uniform(-1, 1) * np.deg2rad(70), rng.uniform(1.2, 2.2), rng.uniform(-0.3, 0.3))
+        run = drive(Mode.FINE_APPROACH, Wheels(start), scene)
+        assert_arrived(run, scene)
+        assert_clear(run, scene, start)
+        times.append(run.time)
+    assert max(times) < 30
+    assert np.median(times) < 18
+
+
+@pytest.mark.parametrize("bearing", [-70, 70])
+@pytest.mark.parametrize("distance", [1.2, 2.2])
+def test_on_the_fine_approach_the_gaze_does_not_lose_the_marker(bearing, distance):
+    """With valve_search moving the head, and sightings only while both cameras see the marker."""
+    scene = Scene(np.array([1.0, -2.0, 0.4]), np.random.default_rng(1))
+    wheels = Wheels(place(scene, np.deg2rad(bearing), distance))
+    head = RobotGeometry().head_pose
+    gaze = {"memory": valve_search.Memory(), "torso": np.zeros(3), "states": set()}
+    p_OV = np.array([*scene.marker[:2], 1.0])
+
+    def visible():
+        p_L = apply(inverse(head(wheels.pose, gaze["torso"])), p_OV)
+        return p_L[2] > 0 and abs(p_L[0] / p_L[2]) < np.tan(0.18) and abs(p_L[1] / p_L[2]) < np.tan(0.15)
+
+    def watch(robot, mode, seen):
+        robot = dc.replace(robot, torso=gaze["torso"], history=np.zeros((1, 7)))
+        gaze["memory"], command, status = valve_search.step(
+            valve_search.ValveSearchConfig(), gaze["memory"], robot.time, DT, robot, mode, seen[0], seen[1], head
+        )
+        gaze["torso"] = command.torso
+        gaze["states"].add(status.state)
+
+    yaw = np.arctan2(*(p_OV[:2] - wheels.pose[:2])[::-1]) - wheels.pose[2]
+    gaze["torso"] = np.array([0.0, 0.2, wrap(yaw)])
+    run = drive(Mode.FINE_APPROACH, wheels, scene, visible=visible, watch=watch)
+    assert_arrived(run, scene)
+    assert gaze["states"] == {"running"}  # it would say failed, marker_lost
+    assert abs(gaze["torso"][0]) < 1e-6  # the waist came back
+
+
+def test_fine_approach_without_noise_ends_within_half_the_tolerance():
+    scene = Scene(np.array([0.0, 0.0, 1.0]), np.random.default_rng(0), noise=0.0)
+    run = drive(Mode.FINE_APPROACH, Wheels(place(scene, 0.5, 1.9)), scene)
+    error = run.poses[-1] - scene.stance()
+    assert np.hypot(*error[:2]) < 0.0075 and abs(error[2]) < 0.009
+    assert np.hypot(*run.twists[-1]) < 0.01
+
+
+def test_fine_approach_at_the_stance_already_only_stands_still_and_succeeds():
+    scene = Scene(np.array([0.0, 0.0, 1.0]), np.random.default_rng(0), noise=0.0)
+    run = drive(Mode.FINE_APPROACH, Wheels(scene.stance() + [0.004, -0.004, 0.003]), scene)
+    assert run.status.state == "succeeded" and run.time < 1.5
+    assert np.max(np.abs(run.twists)) < 1e-9
+
+
+def test_fine_approach_beside_the_stance_backs_off_and_comes_in_again():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    start = scene.stance() + [0.0, 0.04, 0.0]
+    run = drive(Mode.FINE_APPROACH, Wheels(start), scene)
+    assert_arrived(run, scene)
+    back = run.poses[:, 0].min() - start[0]
+    assert -0.75 < back < -0.4  # it went back, by about half a metre
+    assert np.max(np.abs(run.poses[:, 2])) < 0.3  # backwards, without turning round
+
+
+def test_fine_approach_follows_a_stance_that_is_corrected_on_the_way():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+
+    def alter(t, seen):  # from afar the stance is wrong by 8 cm and 4 degrees
+        wrong = np.array([0.03, 0.08, np.deg2rad(4)]) if t < 4 else np.zeros(3)
+        return (*seen[:2], dc.replace(seen[2], base=seen[2].base + wrong))
+
+    run = drive(Mode.FINE_APPROACH, Wheels(place(scene, 0.6, 2.0)), scene, alter=alter)
+    assert_arrived(run, scene)
+
+
+def test_fine_approach_ignores_single_wild_stances():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+
+    def alter(t, seen):
+        wild = int(t * 8) % 4 == 3
+        return (*seen[:2], dc.replace(seen[2], base=seen[2].base + [1.0, 2.0, 1.0])) if wild else seen
+
+    run = drive(Mode.FINE_APPROACH, Wheels(place(scene, 0.3, 1.8)), scene, alter=alter)
+    assert_arrived(run, scene)
+    assert_clear(run, scene, place(scene, 0.3, 1.8))
+
+
+def test_fine_approach_brakes_for_a_stance_at_the_very_edge_of_the_forbidden_zone():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    start = place(scene, 0.0, 2.2)
+    edge = np.array([CONFIG.panel_behind - CONFIG.clearance - 0.002, 0.0, 0.0])
+    run = drive(
+        Mode.FINE_APPROACH,
+        Wheels(start),
+        scene,
+        alter=lambda t, seen: (*seen[:2], dc.replace(seen[2], base=edge)),
+    )
+    assert run.status.state == "succeeded"
+    assert min(scene.clear(p) for p in run.poses) > CONFIG.clearance
+
+
+def test_fine_approach_refuses_a_stance_within_the_clearance():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    run = drive(
+        Mode.FINE_APPROACH,
+        Wheels(place(scene, 0.0, 1.6)),
+        scene,
+        alter=lambda t, seen: (*seen[:2], dc.replace(seen[2], base=seen[2].base + [0.15, 0, 0])),
+    )
+    assert (run.status.state, run.status.verdict) == ("failed", Verdict.REACH_LIMIT)
+    assert "too near" in run.status.detail
+    assert np.max(np.abs(run.twists)) == 0
+
+
+def test_fine_approach_without_a_stance_fails_with_its_reason_and_never_moves():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
+    run = drive(
+        Mode.FINE_APPROACH,
+        Wheels(place(scene, 0.0, 1.6)),
+        scene,
+        alter=lambda t, seen: (*seen[:2], dc.replace(seen[2], found=False, reason="too low")),
+    )
+    assert (run.status.state, run.status.verdict, run.status.detail) == ("failed", Verdict.REACH_LIMIT, "too low")
+    assert np.max(np.abs(run.twists)) == 0
+    assert run.time == pytest.approx(CONFIG.stance_patience, abs=0.1)
+
+
+def test_fine_approach_gives_up_after_its_attempts():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+
+    wheels = Wheels(place(scene, 0.0, 1.8))
+
+    def alter(t, seen):  # the stance steps aside whenever the robot comes near
+        near = np.hypot(*(wheels.pose - scene.stance())[:2]) < 0.1
+        return (*seen[:2], dc.replace(seen[2], base=seen[2].base + [0.0, 0.05 * near, 0.0]))
+
+    run = drive(Mode.FINE_APPROACH, wheels, scene, alter=alter, limit=120)
+    assert run.time < 45  # the supervisor's deadline
+    assert (run.status.state, run.status.verdict) == ("failed", Verdict.REACH_LIMIT)
+    assert f"{CONFIG.attempts} attempts" in run.status.detail
+
+
+def test_commands_stay_within_speed_and_acceleration():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    run = drive(Mode.FINE_APPROACH, Wheels(place(scene, -1.0, 2.0, 0.3)), scene)
+    limit = np.array([CONFIG.acceleration, CONFIG.yaw_acceleration]) * DT
+    assert np.all(np.abs(np.diff(run.twists, axis=0)) <= limit + 1e-12)
+    assert np.all(np.abs(run.twists) <= np.array([CONFIG.fine_speed, CONFIG.yaw_rate]) + 1e-12)
+
+
+# ---------------------------------------------------------------- rough approach
+
+
+def test_rough_approach_turns_to_the_marker_and_stops_between_its_two_distances():
+    rng = np.random.default_rng(8)
+    for _ in range(12):
+        scene = random_scene(rng)
+        start = place(scene, rng.uniform(-1, 1), rng.uniform(2.4, 5), rng.uniform(-np.pi, np.pi))
+        run = drive(Mode.ROUGH_APPROACH, Wheels(start), scene, limit=25)
+        assert run.status.state == "succeeded"
+        x, y, heading = run.poses[-1]
+        to = scene.marker[:2] - [x, y]
+        assert CONFIG.rough_nearest < np.hypot(*to) < CONFIG.rough_distance + 0.02
+        assert abs(wrap(np.arctan2(to[1], to[0]) - heading)) < 0.1
+        assert np.max(np.abs(run.twists[:, 0])) <= CONFIG.speed + 1e-12
+
+
+@pytest.mark.parametrize("distance", [1.0, 1.3, 1.9])
+def test_rough_approach_nearer_than_2_m_succeeds_without_moving(distance):
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
+    run = drive(Mode.ROUGH_APPROACH, Wheels(place(scene, 0.2, distance)), scene)
+    assert run.status.state == "succeeded" and run.time < 0.6
+    assert np.max(np.abs(run.twists[:, 0])) == 0
+
+
+def test_rough_approach_waits_for_a_sighting():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
+    blind = lambda t, seen: (dc.replace(seen[0], found=False), *seen[1:])  # noqa: E731
+    run = drive(Mode.ROUGH_APPROACH, Wheels(place(scene, 0.2, 3.0)), scene, alter=blind, limit=3)
+    assert run.status.state == "running" and np.max(np.abs(run.twists)) == 0
+
+
+# ---------------------------------------------------------------- retreat
+
+
+def test_retreat_goes_straight_back_half_a_metre():
+    scene = Scene(np.array([0.0, 0.0, 0.7]), np.random.default_rng(2))
+    wheels = Wheels(scene.stance())
+    run = drive(Mode.RETREAT, wheels, scene)
+    assert run.status.state == "succeeded" and run.time < 6
+    moved = rot_z(-0.7)[:2, :2] @ (run.poses[-1] - scene.stance())[:2]
+    assert moved == pytest.approx([-CONFIG.retreat_distance, 0.0], abs=0.015)
+    assert np.max(np.abs(run.twists[:, 0])) <= CONFIG.retreat_speed + 1e-12
+
+
+def test_retreat_waits_for_the_arms_but_not_for_ever():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(2))
+    run = drive(Mode.RETREAT, Wheels(scene.stance()), scene, arms=lambda t: 0.4 if t < 3 else 0.0)
+    moving = np.abs(run.twists[:, 0]) > 0
+    assert np.argmax(moving) * DT == pytest.approx(3 + CONFIG.arms_wait, abs=0.05)
+    run = drive(Mode.RETREAT, Wheels(scene.stance()), scene, arms=lambda t: 0.4)
+    assert run.status.state == "succeeded"
+    assert np.argmax(np.abs(run.twists[:, 0]) > 0) * DT == pytest.approx(CONFIG.arms_patience, abs=0.05)
+
+
+# ---------------------------------------------------------------- shape of the behaviour
+
+
+def test_a_track_takes_the_median_heading_across_half_a_turn():
+    track = Track()
+    for k, turn in enumerate((-0.1, 0.0, 0.1, 0.02, 3.0)):
+        track = track.add(k, np.array([0.0, 0, wrap(np.pi + turn)]), 5)
+    assert abs(wrap(track.median[2] - np.pi)) < 0.03
+
+
+@pytest.mark.parametrize("mode", [m for m in Mode if m not in (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT)])
+def test_outside_its_modes_it_is_idle_and_asks_for_nothing(mode):
+    scene = Scene(np.zeros(3), np.random.default_rng(0))
+    robot = RobotState(odometry=np.zeros(5))
+    _, command, status = step(
+        CONFIG, Memory(), 1.0, DT, robot, ModeState(mode=mode.value, activation=7), *scene.look(1.0, np.zeros(3))
+    )
+    assert status.state == "idle"
+    assert all(getattr(command, f.name) is None for f in dc.fields(Command) if f.name != "time")
+
+
+def test_a_new_activation_starts_afresh():
+    scene = Scene(np.zeros(3), np.random.default_rng(0), noise=0.0)
+    robot = RobotState(odometry=np.array([-1.5, 0.0, 0, 0, 0]))
+    memory, result = Memory(), []
+    for activation, count in ((1, 200), (2, 1)):
+        for k in range(count):
+            t = len(result) * DT
+            seen = scene.look(t, robot.odometry[:3])
+            mode = ModeState(mode="rough_approach", activation=activation)
+            memory, _, status = step(CONFIG, memory, t, DT, robot, mode, *seen)
+            result.append((status.activation, status.state))
+    assert result[199] == (1, "succeeded")
+    assert result[200] == (2, "running")
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"speed": 0.0}, "base_approach.speed"),
+        ({"yaw_rate": float("nan")}, "base_approach.yaw_rate"),
+        ({"rough_stop": 1.0}, "base_approach.rough_stop"),
+        ({"braking": 1.5}, "base_approach.braking"),
+    ],
+)
+def test_bad_config_is_refused_by_name(changes, words):
+    with pytest.raises(ConfigError, match=words):
+        BaseApproachConfig(**changes).check()
+    with pytest.raises(ConfigError, match=words):
+        BaseApproachSystem(BaseApproachConfig(**changes))
+
+
+# ---------------------------------------------------------------- block
+
+
+def rig(**inputs) -> Rig:
+    robot = RobotState(odometry=np.array([-3.0, 0.5, 0.1, 0, 0]))
+    fixed = {
+        "robot_state": robot,
+        "mode": ModeState(mode="rough_approach", activation=1),
+        "position": StereoPosition(time=0.001, found=True, covariance=np.eye(3) * 1e-4),
+    }
+    return Rig(BaseApproachSystem(CONFIG), **fixed | inputs)
+
+
+def test_ports():
+    assert ports(BaseApproachSystem(CONFIG)) == {
+        "robot_state": "in abstract",
+        "mode": "in abstract",
+        "position": "in abstract",
+        "estimate": "in abstract",
+        "stance": "in abstract",
+        "command": "out abstract",
+        "status": "out abstract",
+    }
+
+
+def test_block_waits_for_a_sighting_that_is_newer_than_its_activation():
+    dut = rig().run(0.5)
+    assert np.all(dut.read("command").base_twist == 0)
+    dut.fix(position=StereoPosition(time=0.5, found=True))
+    dut.run(1.0)
+    assert dut.read("command").base_twist[0] > 0.1
+    assert (dut.read("status").activation, dut.read("status").state) == (1, "running")
+
+
+def test_block_holds_its_outputs_between_updates():
+    for port in ("command", "status"):
+        assert_holds_between_updates(rig(), port, slot=1)
+
+
+def test_block_clones_are_independent():
+    assert_clones_are_independent(rig, {"mode": ModeState(mode="retreat", activation=2)}, ("command", "status"))
+
+
+def test_block_refuses_a_wrong_message_and_needs_the_robot_state():
+    with pytest.raises(TypeError, match="want Stance"):
+        rig(stance=StereoPosition(), mode=ModeState(mode="fine_approach", activation=1)).run(0.1)
+    with pytest.raises(AttributeError):
+        Rig(BaseApproachSystem(CONFIG), mode=ModeState(mode="retreat", activation=1)).run(0.1)

@@ -1,0 +1,377 @@
+"""valve_search: finds the marker wherever it is, is not fooled by single sightings, keeps it centred, says when it is lost."""
+
+import dataclasses as dc
+import itertools
+
+import numpy as np
+import pytest
+from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+
+from valve_drake.behaviors.valve_search import Memory, ValveSearchConfig, aim, step
+from valve_drake.behaviors.valve_search_system import ValveSearchSystem
+from valve_drake.checks import ConfigError
+from valve_drake.frames import apply, inverse, make, wrap
+from valve_drake.kinematics import RobotGeometry
+from valve_drake.messages import Mode, ModeState, RectangleEstimate, RobotState, StereoPosition, Verdict
+
+DT = 1 / 64  # half the real rate: the laws do not depend on it, and the tests are quicker
+CONFIG = ValveSearchConfig()
+HEAD = RobotGeometry().head_pose
+VIEW = (np.deg2rad(14.5), np.deg2rad(11))  # half the field of the narrower camera
+BASELINE = 0.12
+
+
+def in_view(X_OL: np.ndarray, p_OV: np.ndarray, shift: float = 0.0) -> bool:
+    x, y, z = apply(inverse(X_OL), p_OV) - [shift, 0, 0]
+    return z > 0 and abs(np.arctan2(x, z)) < VIEW[0] and abs(np.arctan2(y, z)) < VIEW[1]
+
+
+@dc.dataclass
+class World:
+    """A robot that follows commands with a lag, and stereo sightings 8 times a second, 30 ms late."""
+
+    p_OV: np.ndarray | None  # the marker, if there is one
+    rng: np.random.Generator
+    base: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))
+    rate: float = 0.0
+    torso: np.ndarray = dc.field(default_factory=lambda: np.array([0.0, 0.1, 0.0]))
+    ghosts: float = 0.0  # chance that an image without the marker shows something anywhere in view
+    pending: list = dc.field(default_factory=list)
+    position: StereoPosition = StereoPosition()
+
+    def tick(self, k: int) -> RobotState:
+        t = k * DT
+        if k % 8 == 0:
+            X_OL = HEAD(self.base, self.torso)
+            self.pending.append((t + 0.03, self._shot(t, k // 8, X_OL)))
+        if self.pending and self.pending[0][0] <= t:
+            self.position = self.pending.pop(0)[1]
+        odometry = np.array([*self.base, 0.0, self.rate])
+        return RobotState(time=t, odometry=odometry, torso=self.torso, history=np.array([[t, *self.base, *self.torso]]))
+
+    def _shot(self, t: float, sequence: int, X_OL: np.ndarray) -> StereoPosition:
+        p_LV = None
+        if self.p_OV is not None and in_view(X_OL, self.p_OV) and in_view(X_OL, self.p_OV, BASELINE):
+            p_LV = apply(inverse(X_OL), self.p_OV)
+        elif self.rng.random() < self.ghosts:
+            p_LV = self.rng.uniform([-0.2, -0.15, 1], [0.2, 0.15, 1]) * self.rng.uniform(1, 6)
+        if p_LV is None:
+            return StereoPosition(time=t, sequence=sequence, X_OL=X_OL, reason="nothing red")
+        sigma = np.array([1e-3, 1e-3, 3e-3 * p_LV[2]]) * p_LV[2]
+        seen = p_LV + sigma * self.rng.normal(size=3)
+        return StereoPosition(t, sequence, True, seen, np.diag(sigma**2), X_OL)
+
+    def obey(self, command) -> None:
+        self.torso = self.torso + (command.torso - self.torso) * DT / 0.05
+        if command.base_twist is not None:
+            assert command.base_twist[0] == 0
+            self.rate += (command.base_twist[1] - self.rate) * DT / 0.08
+            self.base = self.base + [0, 0, self.rate * DT]
+
+
+def search(world: World, limit: float = 60.0, config: ValveSearchConfig = CONFIG):
+    """Runs one search -> status, time, commanded torsos (n, 3)."""
+    memory, mode, torsos = Memory(), ModeState(mode="search", activation=4), []
+    for k in range(int(limit / DT)):
+        robot = world.tick(k)
+        memory, command, status = step(
+            config, memory, k * DT, DT, robot, mode, world.position, RectangleEstimate(), HEAD
+        )
+        world.obey(command)
+        torsos.append(command.torso)
+        if status.state != "running":
+            break
+    assert status.activation == 4
+    return status, k * DT, np.array(torsos), memory
+
+
+def around(bearing: float, distance: float, height: float) -> np.ndarray:
+    return np.array([distance * np.cos(bearing), distance * np.sin(bearing), height])
+
+
+# ---------------------------------------------------------------- search
+
+
+@pytest.mark.parametrize(
+    "bearing, distance, height",
+    [
+        (0.0, 3.0, 1.0),
+        (1.0, 2.5, 0.81),
+        (-1.7, 5.0, 1.22),
+        (2.4, 1.1, 0.81),
+        (-2.6, 1.1, 1.22),
+        (np.pi, 6.0, 0.81),
+        (-3.0, 2.0, 1.0),
+        (2.0, 4.0, 1.22),
+    ],
+)
+def test_search_finds_the_marker_wherever_it_is(bearing, distance, height):
+    p_OV = around(bearing, distance, height)
+    status, time, _, memory = search(World(p_OV, np.random.default_rng(3)))
+    assert status.state == "succeeded", status.detail
+    assert np.linalg.norm(memory.target - p_OV) < 0.05 * distance
+    assert time < 45
+
+
+def test_search_of_a_marker_within_the_first_half_circle_takes_under_12_s():
+    for bearing, distance in itertools.product((-1.5, 0.7), (2.5, 4.5)):
+        status, time, _, _ = search(World(around(bearing, distance, 1.0), np.random.default_rng(1)))
+        assert status.state == "succeeded" and time < 12
+
+
+def test_search_without_a_marker_looks_all_round_at_every_pitch_and_fails_with_not_found():
+    world = World(None, np.random.default_rng(0))
+    looked = []
+    shot = world._shot
+    world._shot = lambda t, n, X: looked.append(X[:, 2]) or shot(t, n, X)
+    status, time, _, _ = search(world)
+    assert (status.state, status.verdict) == ("failed", Verdict.NOT_FOUND)
+    assert time < 55  # before the supervisor's deadline
+    axes = np.array(looked)
+    down = -np.arcsin(axes[:, 2])
+    for pitch in CONFIG.pitches:
+        azimuth = np.sort(np.arctan2(axes[:, 1], axes[:, 0])[np.abs(down - pitch) < 0.02])
+        gaps = np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi))
+        assert gaps.max() < 2 * VIEW[0] - np.arctan(BASELINE / 2.5)  # both cameras, from 2.5 m on
+
+
+def test_search_is_not_fooled_by_scattered_sightings_and_still_finds_the_marker():
+    p_OV = around(2.0, 3.0, 1.0)
+    status, _, _, memory = search(World(p_OV, np.random.default_rng(7), ghosts=0.3))
+    assert status.state == "succeeded"
+    assert np.linalg.norm(memory.target - p_OV) < 0.15
+
+
+def test_search_full_of_scattered_sightings_never_succeeds():
+    status, _, _, _ = search(World(None, np.random.default_rng(2), ghosts=0.5), limit=30)
+    assert status.state != "succeeded"
+
+
+def test_search_ignores_images_from_before_it_began():
+    old = StereoPosition(time=9.0, found=True, p_LV=np.array([0, 0, 3.0]), covariance=np.eye(3) * 1e-6)
+    robot = RobotState(time=10.0, history=np.zeros((1, 7)))
+    memory, mode = Memory(), ModeState(mode="search", activation=1)
+    for k in range(20):
+        old = dc.replace(old, time=9.0 + 0.01 * k)
+        memory, _, status = step(CONFIG, memory, 10 + k * DT, DT, robot, mode, old, RectangleEstimate(), HEAD)
+    assert status.state == "running" and not memory.looks
+
+
+def test_search_stops_the_base_when_it_sees_something_while_turning():
+    world = World(around(np.pi, 3.0, 1.0), np.random.default_rng(3))
+    memory, mode, states, rates = Memory(), ModeState(mode="search", activation=4), ["running"], [0.0]
+    while states.count("succeeded") < 1 / DT:  # a second beyond the success
+        robot = world.tick(len(states))
+        memory, command, status = step(
+            CONFIG, memory, robot.time, DT, robot, mode, world.position, RectangleEstimate(), HEAD
+        )
+        world.obey(command)
+        states.append(status.state)
+        rates.append(command.base_twist[1])
+    assert np.max(np.abs(rates)) == pytest.approx(CONFIG.turn_speed)
+    assert 0.5 < abs(world.base[2]) < 2.8  # it did not turn on to the end of its half turn
+    assert rates[-1] == 0.0 and abs(world.rate) < 0.01
+
+
+def test_torso_commands_start_where_the_robot_is_and_stay_within_speed_and_range():
+    world = World(around(2.5, 3.0, 1.0), np.random.default_rng(3), torso=np.array([0.2, 0.3, -1.0]))
+    _, _, torsos, _ = search(world)
+    speed = np.array([CONFIG.waist_speed, CONFIG.neck_speed, CONFIG.neck_speed])
+    assert np.all(np.abs(torsos[0] - [0.2, 0.3, -1.0]) <= speed * DT)
+    assert np.all(np.abs(np.diff(torsos, axis=0)) <= speed * DT + 1e-12)
+    assert np.all(np.abs(torsos) <= [0.6, 1.1, 1.6])
+
+
+def test_nothing_is_commanded_before_the_robot_was_measured():
+    memory, command, status = step(
+        CONFIG, Memory(), 0.0, DT, RobotState(), ModeState(mode="search"), StereoPosition(), RectangleEstimate(), HEAD
+    )
+    assert command.torso is None and command.base_twist is None and status.state == "idle"
+
+
+# ---------------------------------------------------------------- gaze
+
+
+@pytest.mark.parametrize("waist", [-0.4, 0.0, 0.3])
+@pytest.mark.parametrize("point", [(1.0, 0.3, 0.8), (0.7, -0.2, 0.81), (4.0, 3.0, 1.2), (-0.5, 1.5, 1.0)])
+def test_aim_puts_a_point_on_the_optical_axis(waist, point):
+    base, p_OV = np.array([0.1, -0.2, 0.3]), np.array(point)
+    neck = np.zeros(2)
+    for _ in range(4):  # ticks
+        neck = aim(HEAD, base, np.array([waist, *neck]), p_OV)
+    x, y, z = apply(inverse(HEAD(base, np.array([waist, *neck]))), p_OV)
+    assert z > 0 and np.hypot(x, y) / z < 1e-4
+
+
+def gaze(mode: str, p_OV: np.ndarray, seconds: float, *, base=lambda t: np.zeros(3), source="position", torso=None):
+    """Gaze in one mode on a marker that is always seen -> torsos (n, 3), last status, memory."""
+    memory = Memory()
+    torso = np.zeros(3) if torso is None else torso
+    torsos = []
+    for k in range(int(seconds / DT)):
+        t = k * DT
+        pose = base(t)
+        X_OL = HEAD(pose, torso)
+        p_L = apply(inverse(X_OL), p_OV)
+        position, estimate = StereoPosition(), RectangleEstimate()
+        if source == "position":
+            position = StereoPosition(time=t, found=True, p_LV=p_L, X_OL=X_OL)
+        elif source == "estimate":
+            estimate = RectangleEstimate(time=t, found=True, X_LV=make(np.eye(3), p_L), X_OL=X_OL)
+        robot = RobotState(time=t, odometry=np.array([*pose, 0, 0]), torso=torso, history=np.zeros((1, 7)))
+        state = ModeState(mode=mode, activation=2)
+        memory, command, status = step(CONFIG, memory, t, DT, robot, state, position, estimate, HEAD)
+        torso = command.torso
+        torsos.append(torso)
+    return np.array(torsos), status, memory
+
+
+@pytest.mark.parametrize("mode", [m.value for m in Mode if m != Mode.SEARCH])
+@pytest.mark.parametrize("source", ["position", "estimate"])
+def test_gaze_centres_the_marker_in_every_mode_with_the_waist_back_at_zero(mode, source):
+    p_OV = np.array([0.7, 0.25, 0.9])
+    torsos, _, _ = gaze(mode, p_OV, 3.0, source=source, torso=np.array([0.4, 0.0, -0.5]))
+    x, y, z = apply(inverse(HEAD(np.zeros(3), torsos[-1])), p_OV)
+    assert np.hypot(x, y) / z < 1e-3
+    assert torsos[-1][0] == 0.0
+    assert np.max(np.abs(np.diff(torsos[:, 0]))) <= CONFIG.waist_speed * DT + 1e-12
+
+
+def test_gaze_keeps_the_marker_centred_while_the_base_turns_and_drives():
+    p_OV = np.array([2.0, 0.5, 1.0])
+
+    def base(t):
+        return np.array([0.5 * t, 0.0, 0.6 * np.sin(t)])
+
+    torsos, _, _ = gaze("rough_approach", p_OV, 2.0, base=base)
+    for k in range(int(0.5 / DT), len(torsos)):
+        x, y, z = apply(inverse(HEAD(base(k * DT), torsos[k])), p_OV)
+        assert np.hypot(x, y) / z < np.deg2rad(1)
+
+
+def test_gaze_takes_the_fresher_of_both_stages():
+    memory = Memory()
+    robot = RobotState(history=np.zeros((1, 7)))
+    near, far = np.array([0.0, 0.0, 2.0]), np.array([0.1, 0.0, 2.0])
+    for newer in ("position", "estimate"):
+        times = {"position": 1.0, "estimate": 1.0} | {newer: 1.1}
+        position = StereoPosition(time=times["position"], found=True, p_LV=near)
+        estimate = RectangleEstimate(time=times["estimate"], found=True, X_LV=make(np.eye(3), far))
+        memory, _, _ = step(CONFIG, Memory(), 1.2, DT, robot, ModeState(), position, estimate, HEAD)
+        assert np.array_equal(memory.target, near if newer == "position" else far)
+
+
+def test_gaze_does_not_follow_a_single_false_sighting_but_a_marker_that_moved():
+    robot = RobotState(history=np.zeros((1, 7)))
+    memory = Memory()
+
+    def see(t, p):
+        nonlocal memory
+        position = StereoPosition(time=t, found=True, p_LV=np.array(p, float))
+        memory, _, _ = step(CONFIG, memory, t, DT, robot, ModeState(), position, RectangleEstimate(), HEAD)
+        return memory.target
+
+    see(1.0, (0, 0, 3))
+    assert np.array_equal(see(1.125, (1.5, 0, 3)), [0, 0, 3])
+    assert np.array_equal(see(1.25, (0, 0, 3.01)), [0, 0, 3.01])
+    for k in range(1, 6):
+        target = see(1.25 + k / 8, (1.5, 0, 3))
+    assert np.array_equal(target, [1.5, 0, 3])
+
+
+def test_gaze_survives_a_sighting_that_is_not_finite():
+    torsos, _, memory = gaze("measure", np.array([2.0, np.nan, 1.0]), 0.5)
+    assert np.all(np.isfinite(torsos)) and memory.target is None
+
+
+def test_neck_stays_within_its_limits_and_the_waist_helps_only_while_driving():
+    p_OV = np.array([-1.0, 1.0, 1.0])  # 135 deg to the left
+    for mode, waist in (("fine_approach", CONFIG.sweep_waist), ("reach", 0.0)):
+        torsos, _, _ = gaze(mode, p_OV, 4.0)
+        assert torsos[-1][0] == pytest.approx(waist, abs=1e-9)
+        assert np.max(np.abs(torsos[:, 2])) <= CONFIG.yaw_limit
+        assert torsos[-1][2] == pytest.approx(CONFIG.yaw_limit)
+
+
+def test_without_any_sighting_the_neck_stays():
+    torsos, _, _ = gaze("idle", np.zeros(3), 1.0, source="none", torso=np.array([0.0, 0.3, 0.2]))
+    assert np.allclose(torsos, [0.0, 0.3, 0.2])
+
+
+# ---------------------------------------------------------------- lost
+
+
+@pytest.mark.parametrize("mode", [m.value for m in Mode if m != Mode.SEARCH])
+def test_a_lost_marker_fails_where_it_matters_and_nowhere_else(mode):
+    matters = mode in ("rough_approach", "fine_approach", "measure")
+    _, status, _ = gaze(mode, np.zeros(3), CONFIG.lost_after - 0.1, source="none")
+    assert status.state == ("running" if matters else "idle")
+    _, status, _ = gaze(mode, np.zeros(3), CONFIG.lost_after + 0.1, source="none")
+    assert (status.state, status.verdict) == (("failed", Verdict.MARKER_LOST) if matters else ("idle", ""))
+    assert status.activation == 2
+
+
+def test_a_marker_that_is_seen_is_not_lost():
+    _, status, _ = gaze("measure", np.array([1.0, 0.0, 1.0]), CONFIG.lost_after + 0.5)
+    assert status.state == "running"
+
+
+# ---------------------------------------------------------------- block
+
+
+def rig(**inputs) -> Rig:
+    robot = RobotState(time=0.0, history=np.zeros((1, 7)))
+    return Rig(
+        ValveSearchSystem(CONFIG, HEAD),
+        **{"robot_state": robot, "mode": ModeState(mode="search", activation=1)} | inputs,
+    )
+
+
+def test_ports():
+    assert ports(ValveSearchSystem(CONFIG, HEAD)) == {
+        "robot_state": "in abstract",
+        "mode": "in abstract",
+        "position": "in abstract",
+        "estimate": "in abstract",
+        "command": "out abstract",
+        "status": "out abstract",
+    }
+
+
+def test_block_sweeps_with_open_perception_ports():
+    dut = rig().run(1.0)
+    assert abs(dut.read("command").torso[2]) > 0.3
+    assert dut.read("command").base_twist is not None
+    assert (dut.read("status").activation, dut.read("status").state) == (1, "running")
+
+
+def test_block_holds_its_outputs_between_updates():
+    for port in ("command", "status"):
+        assert_holds_between_updates(rig(), port, slot=1)
+
+
+def test_block_clones_are_independent():
+    assert_clones_are_independent(rig, {"mode": ModeState(mode="idle", activation=2)}, ("command", "status"))
+
+
+def test_block_refuses_a_wrong_message_and_needs_the_mode():
+    with pytest.raises(TypeError, match="want StereoPosition"):
+        rig(position=RectangleEstimate()).run(0.1)
+    with pytest.raises(AttributeError):
+        Rig(ValveSearchSystem(CONFIG, HEAD), robot_state=RobotState(history=np.zeros((1, 7)))).run(0.1)
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"sweep_speed": -1.0}, "valve_search.sweep_speed"),
+        ({"pitches": []}, "valve_search.pitches"),
+        ({"pitches": [2.0]}, "valve_search.pitches"),
+        ({"pitch_low": 2.0}, "valve_search.pitch_low"),
+        ({"sweep_yaw": 1.6}, "valve_search.sweep_yaw"),
+        ({"lost_after": float("nan")}, "valve_search.lost_after"),
+    ],
+)
+def test_bad_config_is_refused_by_name(changes, words):
+    with pytest.raises(ConfigError, match=words):
+        ValveSearchSystem(ValveSearchConfig(**changes), HEAD)

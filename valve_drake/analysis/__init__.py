@@ -1,0 +1,1 @@
+"""From a log to numbers and pages. Everything here reads logs only."""

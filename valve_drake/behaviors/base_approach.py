@@ -1,0 +1,417 @@
+"""Stages 1 and 2 on wheels: a differential drive brought to the stance before the valve, and away from it again.
+
+    rough_approach  turns towards the marker's position of stage 1 and drives until it is nearer than 2 m.
+    fine_approach   by the pose of stage 2, to the stance that kinematic_approach asks for:
+                        turn    to face (or to have behind) the pre-stance, a point straight behind the stance
+                        drive   to it, forwards or backwards, whichever keeps the marker better in view
+                        align   to the stance's heading
+                        line    straight in, steering onto the line through the stance
+                        settle  trim heading and distance, stand still, check
+                    A differential drive cannot step sideways: if it ends beside the stance, it goes through all this again,
+                    which is to back off and come in once more.
+    retreat         straight back, once the arms are still.
+
+The panel is kept clear: the base's centre never comes nearer to the panel's plane than `clearance`. All the motions
+between two allowed points are straight, so they cannot cut through the forbidden half-plane; the speed towards it is
+bounded by braking all the same.
+
+In the stance's frame: s along its heading, e to its left, psi the heading against it. Line law: psi_ref = -atan(e / look).
+Frames: frames.py; everything here is on the floor, in O.
+"""
+
+import dataclasses as dc
+
+import numpy as np
+
+from valve_drake.checks import require, require_positive
+from valve_drake.frames import apply, compose, wrap
+from valve_drake.messages import (
+    Command,
+    Mode,
+    ModeState,
+    RectangleEstimate,
+    RobotState,
+    Stance,
+    Status,
+    StereoPosition,
+    Verdict,
+)
+from valve_drake.motion import slew, towards
+
+MODES = (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT)
+
+
+@dc.dataclass
+class BaseApproachConfig:
+    """Scenario key `base_approach`."""
+
+    speed: float = 0.7  # in the rough approach [m/s]
+    fine_speed: float = 0.5  # to the pre-stance [m/s]
+    line_speed: float = 0.3  # straight in [m/s]
+    reverse_speed: float = 0.3  # [m/s]
+    trim_speed: float = 0.05  # at the stance, at most [m/s]
+    yaw_rate: float = 1.0  # [rad/s]
+    acceleration: float = 0.7  # of the command [m/s^2]
+    yaw_acceleration: float = 1.5  # [rad/s^2]
+    braking: float = 0.6  # share of the accelerations that braking counts on; the rest makes up for the base's lag
+    steering: float = 3.0  # yaw rate per heading error, at most [1/s]
+    closing: float = 2.5  # speed per distance to go, at most: the base lags behind its command [1/s]
+    rough_distance: float = 2.0  # the rough approach ends nearer than this [m]
+    rough_stop: float = 1.85  # and comes to rest here [m]
+    rough_nearest: float = 1.2  # it never drives on from here [m]
+    facing: float = 0.4  # turns on the spot beyond this bearing, before it drives [rad]
+    sightings: int = 5  # the median of so many is what it steers by
+    pre_stance: float = 0.6  # behind the stance [m]
+    look: float = 0.22  # look-ahead of the line law [m]
+    panel_behind: float = 0.131  # marker plane to panel [m]
+    clearance: float = 0.62  # base centre to panel plane [m]
+    position_tolerance: float = 0.015  # [m]
+    heading_tolerance: float = 0.0175  # [rad]
+    still_time: float = 0.3  # [s]
+    still_speed: float = 0.01  # measured, slower is still [m/s]
+    still_rate: float = 0.02  # [rad/s]
+    attempts: int = 4  # at coming in straight
+    stance_patience: float = 5.0  # wait for a first stance [s]
+    retreat_distance: float = 0.5  # [m]
+    retreat_speed: float = 0.2  # [m/s]
+    arms_still: float = 0.05  # joint speed below which the arms are still [rad/s]
+    arms_wait: float = 0.5  # they have to be still for so long before it retreats [s]
+    arms_patience: float = 6.0  # and it retreats anyway after this [s]
+
+    def check(self) -> None:
+        block = "base_approach"
+        require_positive(self, block, vars(self))
+        require(self.braking <= 1, f"{block}.braking", "at most 1", self.braking)
+        ordered = self.rough_nearest < self.rough_stop < self.rough_distance
+        require(ordered, f"{block}.rough_stop", "between rough_nearest and rough_distance", self.rough_stop)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Track:
+    """The median of the last few places (x, y, heading) on the floor: one wild estimate does not move it."""
+
+    seen: float = -np.inf  # time of the newest, or since when they count [s]
+    places: tuple[np.ndarray, ...] = ()
+    median: np.ndarray | None = None
+
+    def add(self, time: float, place: np.ndarray, count: int) -> "Track":
+        places = (*self.places, place)[-count:]
+        rows = np.array(places)
+        rows[:, 2] = [place[2] + wrap(h - place[2]) for h in rows[:, 2]]
+        return Track(time, places, np.median(rows, axis=0))
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Memory:
+    """Everything between two steps."""
+
+    activation: int = -1
+    since: float = 0.0  # of this activation [s]
+    result: str = "running"  # running | succeeded | failed
+    verdict: str = Verdict.NONE.value
+    detail: str = ""
+    progress: float = 0.0
+    twist: np.ndarray = dc.field(default_factory=lambda: np.zeros(2))  # command [m/s, rad/s]
+    start: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # base at the activation [m, m, rad]
+    marker: Track = Track()  # stage 1: heading means nothing
+    panel: Track = Track()  # a point of its plane, and the heading of the normal into it
+    stance: Track = Track()
+    phase: str = "plan"
+    direction: float = 1.0  # of driving to the pre-stance: 1 forwards, -1 backwards
+    attempt: int = 0
+    quiet_since: float = 0.0  # the base or the arms are still since [s]
+
+
+def step(
+    config: BaseApproachConfig,
+    memory: Memory,
+    time: float,
+    dt: float,
+    robot_state: RobotState,
+    mode: ModeState,
+    position: StereoPosition,
+    estimate: RectangleEstimate,
+    stance: Stance,
+) -> tuple[Memory, Command, Status]:
+    """One tick of length dt -> memory, command, status."""
+    if mode.mode not in MODES:
+        return Memory(), Command(time=time), Status(time=time, activation=mode.activation)
+    base = robot_state.odometry[:3]
+    m = memory
+    if mode.activation != m.activation:
+        # The twist goes on from where it is, so that two approaches in a row join smoothly.
+        fresh = Track(seen=time)
+        m = Memory(mode.activation, time, twist=m.twist, start=base, quiet_since=time)
+        m = dc.replace(m, marker=fresh, panel=fresh, stance=fresh)
+    goal = np.zeros(2)
+    if m.result == "running":
+        if mode.mode == Mode.ROUGH_APPROACH:
+            m, goal = _rough(config, m, dt, robot_state, position)
+        elif mode.mode == Mode.FINE_APPROACH:
+            m, goal = _fine(config, m, time, dt, robot_state, estimate, stance)
+        else:
+            m, goal = _retreat(config, m, time, dt, robot_state)
+    m = dc.replace(m, twist=slew(m.twist, goal, np.array([config.acceleration, config.yaw_acceleration]) * dt))
+    status = Status(time, m.activation, m.result, m.verdict, m.detail, m.progress)
+    return m, Command(time=time, base_twist=m.twist), status
+
+
+# ---------------------------------------------------------------- common
+
+
+def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") -> tuple[Memory, np.ndarray]:
+    progress = 1.0 if result == "succeeded" else m.progress
+    return dc.replace(m, result=result, verdict=str(verdict), detail=detail, progress=progress), np.zeros(2)
+
+
+def _drive(config: BaseApproachConfig, gap: float, speed: float, dt: float) -> float:
+    """Forward speed that stops after `gap` [m]."""
+    return towards(gap, min(speed, config.closing * abs(gap)), config.braking * config.acceleration, dt)
+
+
+def _turn(config: BaseApproachConfig, angle: float, dt: float) -> float:
+    """Yaw rate that stops after `angle` [rad]."""
+    rate = min(config.yaw_rate, config.steering * abs(angle))
+    return towards(angle, rate, config.braking * config.yaw_acceleration, dt)
+
+
+def _still(config: BaseApproachConfig, state: RobotState) -> bool:
+    return abs(state.odometry[3]) < config.still_speed and abs(state.odometry[4]) < config.still_rate
+
+
+def _sure(config: BaseApproachConfig, track: Track) -> bool:
+    """A first glance can be wrong, so it takes a few."""
+    return len(track.places) >= min(3, config.sightings)
+
+
+# ---------------------------------------------------------------- stage 1
+
+
+def _rough(
+    config: BaseApproachConfig, m: Memory, dt: float, state: RobotState, position: StereoPosition
+) -> tuple[Memory, np.ndarray]:
+    if position.found and position.time > m.marker.seen:
+        p_OV = apply(position.X_OL, position.p_LV)
+        m = dc.replace(m, marker=m.marker.add(position.time, np.array([p_OV[0], p_OV[1], 0.0]), config.sightings))
+    if m.marker.median is None:
+        return m, np.zeros(2)
+    x, y, heading = state.odometry[:3]
+    p = m.marker.median
+    distance = float(np.hypot(p[0] - x, p[1] - y))
+    bearing = wrap(float(np.arctan2(p[1] - y, p[0] - x)) - heading)
+    m = dc.replace(
+        m,
+        detail=f"marker {distance:.2f} m away",
+        progress=float(np.clip(config.rough_distance / distance, 0, 1)),
+    )
+    if distance < config.rough_distance and _still(config, state):
+        return _end(m, "succeeded", detail=m.detail) if _sure(config, m.marker) else (m, np.zeros(2))
+    forward = 0.0
+    if abs(bearing) < config.facing and distance > config.rough_nearest:
+        forward = _drive(config, max(distance - config.rough_stop, 0.0), config.speed, dt) * np.cos(bearing)
+    rate = _turn(config, bearing, dt) if distance > config.rough_stop else 0.0
+    return m, np.array([forward, rate])
+
+
+# ---------------------------------------------------------------- stage 2
+
+
+@dc.dataclass(frozen=True)
+class _Offset:
+    """The base against the stance."""
+
+    s: float  # along the stance's heading [m]
+    e: float  # to its left [m]
+    psi: float  # heading [rad]
+
+
+def _offset(base: np.ndarray, goal: np.ndarray) -> _Offset:
+    c, s = np.cos(goal[2]), np.sin(goal[2])
+    dx, dy = base[:2] - goal[:2]
+    return _Offset(float(c * dx + s * dy), float(c * dy - s * dx), wrap(float(base[2] - goal[2])))
+
+
+def _fine(
+    config: BaseApproachConfig,
+    m: Memory,
+    time: float,
+    dt: float,
+    state: RobotState,
+    estimate: RectangleEstimate,
+    stance: Stance,
+) -> tuple[Memory, np.ndarray]:
+    if estimate.found and estimate.time > m.panel.seen:
+        m = dc.replace(m, panel=m.panel.add(estimate.time, _panel(config, estimate), config.sightings))
+    if stance.found and stance.time > m.stance.seen:
+        m = dc.replace(m, stance=m.stance.add(stance.time, stance.base, config.sightings))
+    if not (_sure(config, m.panel) and _sure(config, m.stance)):
+        if time - m.since > config.stance_patience:
+            return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
+        return dc.replace(m, detail="waiting for a stance"), np.zeros(2)
+    goal, panel = m.stance.median, m.panel.median
+    room = _room(config, panel, goal)
+    if room < 0:
+        return _end(m, "failed", Verdict.REACH_LIMIT, f"the stance is {-room:.3f} m too near to the panel")
+    base = state.odometry[:3]
+    at = _offset(base, goal)
+    if m.phase == "plan":
+        m = _plan(config, m, base, goal, at, panel)
+        if m.result == "failed":
+            return m, np.zeros(2)
+    if m.phase == "settle":
+        m, twist = _settle(config, m, time, dt, state, at)
+    else:
+        m, twist = PHASES[m.phase](config, m, dt, base, goal, at)
+    # Towards the panel never faster than braking allows.
+    into = float(np.cos(base[2] - panel[2])) * np.sign(twist[0])
+    if into > 0:
+        fastest = _drive(config, max(_room(config, panel, base), 0.0), config.speed, dt) / into
+        twist = np.array([np.clip(twist[0], -fastest, fastest), twist[1]])
+    if m.result == "running":
+        m = dc.replace(m, detail=f"{m.phase}: {-at.s:.3f} m to go, {at.e:+.3f} m aside, {np.degrees(at.psi):+.1f} deg")
+    return m, twist
+
+
+def _ahead(pose: np.ndarray, distance: float) -> np.ndarray:
+    """The point `distance` ahead of a pose (x, y, heading) -> (2,)."""
+    return pose[:2] + distance * np.array([np.cos(pose[2]), np.sin(pose[2])])
+
+
+def _panel(config: BaseApproachConfig, estimate: RectangleEstimate) -> np.ndarray:
+    """A point of the panel's plane and the heading of its normal into it, on the floor -> (3,)."""
+    X_OV = compose(estimate.X_OL, estimate.X_LV)
+    marker = np.array([*X_OV[:2, 3], np.arctan2(X_OV[1, 2], X_OV[0, 2])])
+    return np.array([*_ahead(marker, config.panel_behind), marker[2]])
+
+
+def _room(config: BaseApproachConfig, panel: np.ndarray, base: np.ndarray) -> float:
+    """How far the base may still go towards the panel [m]."""
+    return -_offset(base, panel).s - config.clearance
+
+
+def _pre_stance(config: BaseApproachConfig, goal: np.ndarray) -> np.ndarray:
+    return _ahead(goal, -config.pre_stance)
+
+
+def _within(config: BaseApproachConfig, at: _Offset) -> bool:
+    return np.hypot(at.s, at.e) <= config.position_tolerance and abs(at.psi) <= config.heading_tolerance
+
+
+def _plan(
+    config: BaseApproachConfig, m: Memory, base: np.ndarray, goal: np.ndarray, at: _Offset, panel: np.ndarray
+) -> Memory:
+    """Chooses the first phase of a new attempt."""
+    if _within(config, at):
+        return dc.replace(m, phase="settle")
+    if m.attempt >= config.attempts:
+        return _end(m, "failed", Verdict.REACH_LIMIT, f"still {at.e:+.3f} m aside after {m.attempt} attempts")[0]
+    m = dc.replace(m, attempt=m.attempt + 1)
+    # In the funnel before the stance the line law alone brings it in.
+    if -2 * config.pre_stance < at.s < 0 and abs(at.e) < -at.s / 8 and abs(at.psi) < config.facing:
+        return dc.replace(m, phase="line")
+    way = _pre_stance(config, goal) - base[:2]
+    if np.linalg.norm(way) < 0.05:
+        return dc.replace(m, phase="align")
+    # The widest angle between the robot's front and the marker on the way, for driving forwards and backwards.
+    marker = _ahead(panel, -config.panel_behind)
+    lines = [marker - base[:2], marker - base[:2] - way]
+    course = np.arctan2(way[1], way[0])
+    angles = [abs(wrap(float(np.arctan2(line[1], line[0]) - course))) for line in lines]
+    forwards, backwards = max(angles), np.pi - min(angles)
+    return dc.replace(m, phase="turn", direction=1.0 if forwards <= backwards + 0.1 else -1.0)
+
+
+def _course_error(m: Memory, base: np.ndarray, way: np.ndarray) -> float:
+    """How far the base has to turn to drive along `way` in its direction."""
+    course = float(np.arctan2(way[1], way[0])) + (0.0 if m.direction > 0 else np.pi)
+    return wrap(course - float(base[2]))
+
+
+def _turn_phase(
+    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
+) -> tuple[Memory, np.ndarray]:
+    error = _course_error(m, base, _pre_stance(config, goal) - base[:2])
+    if abs(error) < 0.05 and abs(m.twist[1]) < 0.2:
+        return dc.replace(m, phase="drive"), np.zeros(2)
+    return m, np.array([0.0, _turn(config, error, dt)])
+
+
+def _drive_phase(
+    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
+) -> tuple[Memory, np.ndarray]:
+    way = _pre_stance(config, goal) - base[:2]
+    left = m.direction * float(way @ [np.cos(base[2]), np.sin(base[2])])
+    if left < 0.02:
+        return dc.replace(m, phase="align"), np.zeros(2)
+    error = _course_error(m, base, way)
+    speed = config.fine_speed if m.direction > 0 else config.reverse_speed
+    # Close to the point its direction swings round; the heading is kept there.
+    rate = _turn(config, error, dt) if np.linalg.norm(way) > 0.15 else 0.0
+    if abs(error) > config.facing and np.linalg.norm(way) > 0.15:
+        return dc.replace(m, phase="turn"), np.array([0.0, rate])
+    return m, np.array([m.direction * _drive(config, left, speed, dt), rate])
+
+
+def _align_phase(
+    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
+) -> tuple[Memory, np.ndarray]:
+    if abs(at.psi) < 0.03 and abs(m.twist[1]) < 0.1:
+        # Too far aside for the line law: a new attempt.
+        return dc.replace(m, phase="line" if abs(at.e) < config.pre_stance / 5 else "plan"), np.zeros(2)
+    return m, np.array([0.0, _turn(config, -at.psi, dt)])
+
+
+def _line_phase(
+    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
+) -> tuple[Memory, np.ndarray]:
+    if at.s > -0.005:
+        return dc.replace(m, phase="settle"), np.zeros(2)
+    psi_ref = float(-np.arctan(at.e / config.look))
+    rate = float(np.clip(config.steering * wrap(psi_ref - at.psi), -config.yaw_rate, config.yaw_rate))
+    return m, np.array([_drive(config, -at.s, config.line_speed, dt), rate])
+
+
+PHASES = {"turn": _turn_phase, "drive": _drive_phase, "align": _align_phase, "line": _line_phase}
+
+
+def _settle(
+    config: BaseApproachConfig, m: Memory, time: float, dt: float, state: RobotState, at: _Offset
+) -> tuple[Memory, np.ndarray]:
+    """Trims heading and distance; then stillness decides."""
+    turn = abs(at.psi) > config.heading_tolerance / 3
+    shift = abs(at.s) > config.position_tolerance / 3
+    busy = turn or (shift and abs(at.e) < config.position_tolerance)
+    if busy or not _still(config, state):
+        m = dc.replace(m, quiet_since=time)
+    elif time - m.quiet_since >= config.still_time:
+        if _within(config, at):
+            detail = f"{1e3 * at.s:+.0f} mm along, {1e3 * at.e:+.0f} mm aside, {np.degrees(at.psi):+.2f} deg"
+            return _end(m, "succeeded", detail=detail)
+        return dc.replace(m, phase="plan"), np.zeros(2)
+    rate = _turn(config, -at.psi, dt) if turn else 0.0
+    forward = _drive(config, -at.s, config.trim_speed, dt) if shift else 0.0
+    return m, np.array([forward, rate])
+
+
+# ---------------------------------------------------------------- retreat
+
+
+def _retreat(
+    config: BaseApproachConfig, m: Memory, time: float, dt: float, state: RobotState
+) -> tuple[Memory, np.ndarray]:
+    x, y, heading = state.odometry[:3]
+    c, s = np.cos(m.start[2]), np.sin(m.start[2])
+    back = float(c * (m.start[0] - x) + s * (m.start[1] - y))
+    if m.phase == "plan":
+        speed = max(np.max(np.abs(state.left_arm_velocity)), np.max(np.abs(state.right_arm_velocity)))
+        if speed > config.arms_still:
+            m = dc.replace(m, quiet_since=time)
+        if time - m.quiet_since < config.arms_wait and time - m.since < config.arms_patience:
+            return dc.replace(m, detail="waiting for the arms"), np.zeros(2)
+        m = dc.replace(m, phase="back")
+    left = config.retreat_distance - back
+    m = dc.replace(m, detail=f"{back:.2f} m back", progress=float(np.clip(back / config.retreat_distance, 0, 1)))
+    if left < 0.01 and _still(config, state):
+        return _end(m, "succeeded", detail=f"{back:.2f} m back")
+    rate = _turn(config, wrap(float(m.start[2]) - heading), dt)
+    return m, np.array([-_drive(config, max(left, 0.0), config.retreat_speed, dt), rate])

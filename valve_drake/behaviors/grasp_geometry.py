@@ -1,0 +1,142 @@
+"""Where the hands hold the valve, for any angle of it; and the stance from which they can.
+
+With both hands on the handles, a hand's pose X_VG in the marker's frame does not change while the valve
+turns, since V turns with it. Turning by theta (positive opens, about -z of V): X_OV(theta) = X_OV R_z(-theta).
+"""
+
+import dataclasses as dc
+
+import numpy as np
+
+from valve_drake.checks import require_in, require_positive
+from valve_drake.frames import compose, inverse, make, planar, rot_z
+from valve_drake.kinematics import RobotGeometry, lateral
+from valve_drake.messages import SIDES
+from valve_drake.perception.marker import Marker
+
+
+@dc.dataclass
+class StanceConfig:
+    """Scenario key `stance`: which places to stand at are tried."""
+
+    distance_min: float = 0.64  # shoulder axis to the panel's axis point, along the floor [m]
+    distance_max: float = 0.84
+    distance_step: float = 0.02
+    standoff: float = 0.12  # hands start and end this far from the grasp, against the wrist camera's view [m]
+    arc_step: float = 0.1745  # [rad]
+    margin_min: float = 0.15  # least arm margin that is accepted (1 is comfortable)
+
+    def check(self) -> None:
+        require_positive(self, "stance", vars(self))
+        require_in(self.distance_min, 0.5, self.distance_max, "stance.distance_min")
+
+
+def turned(X_AV: np.ndarray, angle: float) -> np.ndarray:
+    """The marker's pose after the valve turned by `angle` (positive opens) -> (3, 4)."""
+    return compose(X_AV, make(rot_z(-angle), np.zeros(3)))
+
+
+def turn_between(X_AV0: np.ndarray, X_AV1: np.ndarray) -> float:
+    """The angle turned from pose 0 to pose 1 about the common axis, in (-pi, pi], positive opens."""
+    R = X_AV0[:, :3].T @ X_AV1[:, :3]
+    return float(-np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
+
+
+def hand_in_valve(side: str, swapped: bool, marker: Marker) -> np.ndarray:
+    """X_VG of a hand on its handle -> (3, 4). z_G into the panel, x_G along the bar, towards the left hand's end."""
+    s = lateral(side) * (-1.0 if swapped else 1.0)
+    R = np.eye(3) if swapped else np.diag([-1.0, -1.0, 1.0])
+    return make(R, np.array([-s * marker.handle_radius, 0, marker.handle_depth]))
+
+
+def standoff(X_AG: np.ndarray, view_G: np.ndarray, distance: float) -> np.ndarray:
+    """The hand drawn back from X_AG by `distance` against its camera's view direction (in G), so that the
+    mark stays in the middle of the wrist image -> (3, 4)."""
+    return make(X_AG[:, :3], X_AG[:, 3] - distance * X_AG[:, :3] @ view_G)
+
+
+@dc.dataclass(frozen=True)
+class ArcCheck:
+    """Both arms along a turn: the least margin over it, and the joint angles at its start."""
+
+    margin: float
+    swapped: bool
+    q_left: np.ndarray | None = None
+    q_right: np.ndarray | None = None
+
+
+def check_arc(
+    X_BV: np.ndarray,
+    turn_angle: float,
+    swapped: bool,
+    geometry: RobotGeometry,
+    marker: Marker,
+    config: StanceConfig,
+    view: dict[str, np.ndarray],
+) -> ArcCheck:
+    """Can both hands hold their handles all along the turn, and draw back from them at both ends?
+
+    X_BV: marker in the base, waist at zero. view: each wrist camera's view direction in its hand's frame.
+    """
+    X_HV = compose(inverse(geometry.X_BH()), X_BV)
+    count = max(2, int(np.ceil(abs(turn_angle) / config.arc_step)) + 1)
+    angles = np.linspace(0.0, turn_angle, count)
+    margin, first = 1.0, {}
+    for side in SIDES:
+        X_VG = hand_in_valve(side, swapped, marker)
+        q_last = None
+        for k, angle in enumerate(angles):
+            X_HG = compose(turned(X_HV, angle), X_VG)
+            q = geometry.arm_inverse(X_HG, side, q_last)
+            if q is None or (q_last is not None and np.max(np.abs(q - q_last)) > 1.0):
+                return ArcCheck(-1.0, swapped)  # out of reach, or a jump to another branch
+            margin = min(margin, geometry.arm_margin(q))
+            if k in (0, count - 1):
+                back = geometry.arm_inverse(standoff(X_HG, view[side], config.standoff), side, q)
+                if back is None:
+                    return ArcCheck(-1.0, swapped)
+                margin = min(margin, geometry.arm_margin(back))
+            first.setdefault(side, q)
+            q_last = q
+            if margin <= 0:
+                return ArcCheck(margin, swapped)
+    return ArcCheck(margin, swapped, first["left"], first["right"])
+
+
+def best_arc(
+    X_BV: np.ndarray,
+    turn_angle: float,
+    geometry: RobotGeometry,
+    marker: Marker,
+    config: StanceConfig,
+    view: dict[str, np.ndarray],
+) -> ArcCheck:
+    """The better of the two ways to share the handles between the hands."""
+    arcs = [check_arc(X_BV, turn_angle, swapped, geometry, marker, config, view) for swapped in (False, True)]
+    return max(arcs, key=lambda arc: arc.margin)
+
+
+def find_stance(
+    X_OV: np.ndarray,
+    turn_angle: float,
+    geometry: RobotGeometry,
+    marker: Marker,
+    config: StanceConfig,
+    view: dict[str, np.ndarray],
+) -> tuple[np.ndarray, float]:
+    """The base pose (x, y, heading) in O, square to the panel, with the largest arm margin over the whole turn.
+
+    Returns (base (3,), margin); margin < 0 where no stance serves.
+    """
+    heading = float(np.arctan2(X_OV[1, 2], X_OV[0, 2]))  # of z_V, into the panel, on the floor
+    forward = np.array([np.cos(heading), np.sin(heading)])
+    axis_point = X_OV[:, 3] + marker.panel_depth * X_OV[:, 2]  # the stem at the panel
+    best, margin = np.zeros(3), -1.0
+    for distance in np.arange(config.distance_min, config.distance_max + 1e-9, config.distance_step):
+        xy = axis_point[:2] - distance * forward
+        base = np.array([xy[0], xy[1], heading])
+        X_BV = compose(inverse(planar(*base)), X_OV)
+        arc = best_arc(X_BV, turn_angle, geometry, marker, config, view)
+        if arc.margin > margin:
+            best, margin = base, arc.margin
+    return best, margin

@@ -1,0 +1,477 @@
+"""Stage 5: both hands grasp the valve and turn it under hybrid force and position control; then let go.
+
+The two arms and the valve form one closed chain with a single free motion, the turn. With everything at the valve's
+centre c (mid-point of the hands) and u the valve's axis towards the robot, the wrenches felt by the hands and the
+hands' twists are split into common and relative parts [Uchiyama, Dauchez 1988]:
+
+    h_i = [m_i + (p_i - c) x f_i ; f_i]       h_a = h_1 + h_2       h_r = (h_2 - h_1) / 2              (1)
+    V_1 = V_a - V_r / 2,  V_2 = V_a + V_r / 2                                                          (2)
+    u . w_a = turn rate;   the other five of V_a = D_a^-1 h_a                                          (3)
+    V_r = D_r^-1 (h_r - h_r*)                                                                          (4)
+    h_r* = squeeze b - (tau / L) t                                                                     (5)
+
+hand 1 left, 2 right; b from hand 1 to 2, t = u x b, L their distance, tau the couple on the valve. D_a = 2 D and
+D_r = D / 2 give each hand the same damping D. The term of (5) in tau is not optional: the two driving forces are
+themselves a relative wrench, and a constant h_r* would make the hands yield to the couple that they should apply.
+
+There is no integrator on the turn: the rate is scaled down as the torque nears its limit, so a stuck valve never
+winds up energy. The joints get positions only; feeding the admittance's velocity forward makes the loop oscillate.
+
+All vectors are in the chest frame H, which stands still while the hands are on the valve.
+"""
+
+import dataclasses as dc
+
+import numpy as np
+
+from valve_drake.behaviors.grasp_geometry import standoff
+from valve_drake.checks import require_in, require_positive
+from valve_drake.frames import make, rotation, wrap
+from valve_drake.kinematics import RobotGeometry
+from valve_drake.messages import (
+    LEFT,
+    SIDES,
+    Command,
+    GraspPlan,
+    Mode,
+    ModeState,
+    RobotState,
+    Status,
+    TurnState,
+    Verdict,
+)
+from valve_drake.perception.marker import Marker
+
+GRAVITY = 9.81
+
+
+@dc.dataclass
+class HybridRotationConfig:
+    """Scenario key `hybrid_rotation`."""
+
+    damping: float = 2500.0  # D, of each hand [N s/m]
+    angular_damping: float = 160.0  # [N m s/rad]
+    filter: float = 10.0  # low-pass of the wrenches [Hz]
+    rate: float = 0.105  # of the turn [rad/s]
+    ramp: float = 0.5  # to full rate and back [s]
+    slow: float = 0.006  # least rate near the goal [rad/s]
+    torque_limit: float = 12.0  # on the valve; the rate goes to zero over its last 30 % [N m]
+    lead_limit: float = 0.05  # commanded ahead of measured angle, second line of defence [rad]
+    force_trip: float = 55.0  # of one hand: stop [N]
+    squeeze: float = 0.0  # along the bar [N]
+    tolerance: float = 0.001  # of the turned angle, by the hands [rad]
+    stall_time: float = 2.0  # without progress [s]
+    stall_angle: float = 0.01  # that counts as progress [rad]
+    back_off: float = 0.07  # tried the other way after a stall [rad]
+    grip_force: float = 70.0  # of the finger actuator [N]
+    grip_margin: float = 0.005  # opening off the handle's width that is no grasp [m]
+    tug_force: float = 8.0  # that proves the grasp, each hand [N]
+    tug_speed: float = 0.01  # [m/s]
+    tug_reach: float = 0.012  # without force: missed [m]
+    close_time: float = 4.0  # deadline for closing [s]
+    relax: float = 0.6  # bleeding the wrenches before opening [s]
+    opening: float = 0.085  # [m]
+    open_force: float = 40.0  # [N]
+    retreat: float = 0.12  # hands drawn back after opening [m]
+    retreat_speed: float = 0.10  # [m/s]
+    tare_time: float = 0.2  # time constant of the wrist sensors' tare at the stand-off [s]
+
+    def check(self) -> None:
+        require_positive(self, "hybrid_rotation", [name for name in vars(self) if name != "squeeze"])
+        require_in(self.squeeze, 0.0, 30.0, "hybrid_rotation.squeeze")
+        require_in(self.torque_limit, 1.0, 16.0, "hybrid_rotation.torque_limit")
+
+
+def gravity_wrench(R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.ndarray:
+    """What the hand's own weight puts on the wrist sensor, in its frame -> [torque; force] (6,)."""
+    force = R_HG.T @ np.array([0.0, 0.0, -GRAVITY * geometry.hand_mass])
+    p = np.array(geometry.p_SHand) * (1.0 if side == LEFT else np.array([-1.0, 1, 1]))
+    return np.concatenate([np.cross(p, force), force])
+
+
+def contact_wrench(raw: np.ndarray, bias: np.ndarray, R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.ndarray:
+    """Load from outside on the hand, at its grip point, in H -> [torque; force] (6,)."""
+    load = raw - bias - gravity_wrench(R_HG, geometry, side)
+    p_SG = np.array([0.0, 0.0, geometry.grip_behind])
+    torque = load[:3] - np.cross(p_SG, load[3:])
+    return np.concatenate([R_HG @ torque, R_HG @ load[3:]])
+
+
+@dc.dataclass(frozen=True)
+class Chain:
+    """The closed chain at one instant, measured (all in H)."""
+
+    p: np.ndarray  # grip points (2, 3), left first
+    f: np.ndarray  # forces felt (2, 3) [N]
+    m: np.ndarray  # moments felt at the grip points (2, 3) [N m]
+    c: np.ndarray  # centre (3,)
+    u: np.ndarray  # axis towards the robot
+    b: np.ndarray  # along the bar, left to right hand
+    t: np.ndarray  # u x b
+    L: float  # distance of the hands
+
+    @property
+    def h(self) -> np.ndarray:
+        """h_1, h_2 of (1) -> (2, 6)."""
+        moments = self.m + np.cross(self.p - self.c, self.f)
+        return np.hstack([moments, self.f])
+
+    @property
+    def couples(self) -> np.ndarray:
+        """What each hand puts on the valve about u -> (2,) [N m]."""
+        return -(self.h[:, :3] @ self.u)
+
+    @property
+    def torque(self) -> float:
+        return float(np.sum(self.couples))
+
+
+def make_chain(p: np.ndarray, wrenches: np.ndarray, u: np.ndarray) -> Chain:
+    """p (2, 3), wrenches at the grip points (2, 6), axis u -> Chain."""
+    c = p.mean(axis=0)
+    line = p[1] - p[0]
+    line = line - u * (u @ line)
+    L = float(np.linalg.norm(line))
+    b = line / L
+    return Chain(p, wrenches[:, 3:], wrenches[:, :3], c, u, b, np.cross(u, b), L)
+
+
+def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, extra: np.ndarray) -> np.ndarray:
+    """Eq. (2)-(5): the twists [w; v at c] of both hands -> (2, 6).
+
+    turn_rate: about u [rad/s]; None lets the hands yield in that direction too.
+    extra: added to the common twist (6,), e.g. a tug.
+    """
+    h1, h2 = chain.h
+    D = np.concatenate([np.full(3, config.angular_damping), np.full(3, config.damping)])
+    h_a, h_r = h1 + h2, (h2 - h1) / 2
+    V_a = h_a / (2 * D)
+    target = np.zeros(6)
+    if turn_rate is not None:
+        V_a[:3] += chain.u * (turn_rate - chain.u @ V_a[:3])
+        # Beyond the limit the target stops following, or the relative loop would wind a stuck valve up.
+        couple = float(np.clip(chain.torque, -config.torque_limit, config.torque_limit))
+        target[3:] = config.squeeze * chain.b - (couple / chain.L) * chain.t
+    V_a = V_a + extra
+    V_r = (h_r - target) / (D / 2)
+    return np.array([V_a - V_r / 2, V_a + V_r / 2])
+
+
+def turn_rate(left: float, rate: float, torque: float, lead: float, config: HybridRotationConfig, dt: float) -> float:
+    """The rate for the next tick, all along the sense of the turn (positive = towards the goal).
+
+    left: still to turn [rad]; rate: now; torque, lead: see the config's limits.
+    """
+    acceleration = config.rate / config.ramp
+    brake = np.sqrt(2 * acceleration * max(left, 0.0))
+    wanted = max(config.slow, min(config.rate, brake)) if left > 0 else 0.0
+    by_torque = (config.torque_limit - torque) / (0.3 * config.torque_limit)
+    by_lead = (config.lead_limit - lead) / (0.25 * config.lead_limit)
+    scaled = wanted * float(np.clip(min(by_torque, by_lead), 0.0, 1.0))
+    return min(scaled, rate + acceleration * dt)
+
+
+@dc.dataclass(frozen=True)
+class Memory:
+    activation: int = -1
+    stage: str = ""
+    since: float = 0.0  # of the stage [s]
+    bias: np.ndarray = dc.field(default_factory=lambda: np.zeros((2, 6)))
+    tared: bool = False
+    wrenches: np.ndarray = dc.field(default_factory=lambda: np.zeros((2, 6)))  # filtered, at the grip points, in H
+    X: tuple[np.ndarray, np.ndarray] | None = None  # commanded X_HG
+    q: tuple[np.ndarray, np.ndarray] | None = None  # commanded joints
+    start: tuple[np.ndarray, np.ndarray] | None = None  # X_HG at the stage's beginning
+    b0: np.ndarray | None = None  # bar direction at the grasp
+    turned: float = 0.0  # by the hands since the grasp, unwrapped [rad]
+    commanded: float = 0.0
+    rate: float = 0.0  # commanded, along the turn's sense
+    mark: tuple[float, float] = (0.0, 0.0)  # (time, angle) of the last progress
+    stalls: int = 0
+    stalled_at: float = 0.0
+    tripped: int = 0  # ticks over the force trip
+    odd: float = 0.0  # time with an odd share or opening [s]
+    tugged: tuple[bool, bool] = (False, False)
+    status: Status = Status()
+    telemetry: TurnState = TurnState()
+
+
+class HybridRotation:
+    """The mathematics of the stage. view: the wrist cameras' view directions (hands draw back against them)."""
+
+    def __init__(
+        self,
+        config: HybridRotationConfig,
+        marker: Marker,
+        geometry: RobotGeometry,
+        view: dict[str, np.ndarray],
+    ):
+        config.check()
+        self.config = dc.replace(config)
+        self.marker = dc.replace(marker)
+        self.geometry = geometry
+        self.view = view
+
+    def step(
+        self, time: float, dt: float, memory: Memory, state: RobotState, mode: ModeState, plan: GraspPlan
+    ) -> tuple[Memory, Command]:
+        """One tick of length dt -> memory (with status and telemetry), command."""
+        q = (state.left_arm, state.right_arm)
+        X = tuple(self.geometry.arm_forward(q[k], side) for k, side in enumerate(SIDES))
+        m = self._sense(dt, memory, state, mode, X)
+        if mode.mode not in (Mode.GRASP, Mode.TURN, Mode.RELEASE):
+            return dc.replace(m, activation=-1, status=Status()), Command(time=time)
+        p = np.array([X[0][:, 3], X[1][:, 3]])
+        u = -plan.X_BV[:, 2]  # H and B have the same axes while the waist is at zero
+        chain = make_chain(p, m.wrenches, u)
+        if mode.activation != m.activation:
+            m = self._begin(time, m, mode, X, q, chain)
+        m = self._angle(m, chain)
+        run = {Mode.GRASP: self._grasp, Mode.TURN: self._turn, Mode.RELEASE: self._release}[Mode(mode.mode)]
+        m, V, gripper = run(time, dt, m, state, mode, chain)
+        m = self._move(dt, m, V, chain)
+        m = dc.replace(m, telemetry=self._telemetry(time, m, chain))
+        command = Command(
+            time=time, left_arm=m.q[0], right_arm=m.q[1], left_gripper=gripper, right_gripper=gripper
+        )
+        return m, command
+
+    # ------------------------------------------------------------ sensing
+    def _sense(self, dt: float, m: Memory, state: RobotState, mode: ModeState, X: tuple) -> Memory:
+        """Tares the sensors while the hands stand still at the stand-off; filters the contact wrenches otherwise."""
+        raw = (state.left_wrench, state.right_wrench)
+        if mode.mode == Mode.REACH:
+            still = max(np.max(np.abs(state.left_arm_velocity)), np.max(np.abs(state.right_arm_velocity))) < 0.02
+            if not still:
+                return dc.replace(m, tared=False) if m.tared else m
+            load = np.array(
+                [raw[k] - gravity_wrench(X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)]
+            )
+            a = 1 - np.exp(-dt / self.config.tare_time)
+            bias = m.bias + a * (load - m.bias) if m.tared else load
+            return dc.replace(m, bias=bias, tared=True, wrenches=np.zeros((2, 6)))
+        now = np.array(
+            [contact_wrench(raw[k], m.bias[k], X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)]
+        )
+        a = 1 - np.exp(-2 * np.pi * self.config.filter * dt)
+        return dc.replace(m, wrenches=m.wrenches + a * (now - m.wrenches))
+
+    def _begin(self, time: float, m: Memory, mode: ModeState, X: tuple, q: tuple, chain: Chain) -> Memory:
+        stage = {Mode.GRASP: "close", Mode.TURN: "turn", Mode.RELEASE: "relax"}[Mode(mode.mode)]
+        if mode.mode == Mode.GRASP or m.X is None:
+            m = dc.replace(m, X=X, q=q, b0=chain.b, turned=0.0, commanded=0.0)
+        if mode.mode == Mode.TURN:
+            m = dc.replace(m, b0=chain.b, turned=0.0, commanded=0.0)
+        return dc.replace(
+            m,
+            activation=mode.activation,
+            stage=stage,
+            since=time,
+            start=m.X,
+            rate=0.0,
+            mark=(time, 0.0),
+            stalls=0,
+            tripped=0,
+            odd=0.0,
+            tugged=(False, False),
+            status=Status(time, mode.activation, "running"),
+        )
+
+    def _angle(self, m: Memory, chain: Chain) -> Memory:
+        """Angle of the line between the hands about u since b0, unwrapped."""
+        b0 = m.b0 - chain.u * (chain.u @ m.b0)
+        now = float(np.arctan2(chain.u @ np.cross(b0, chain.b), b0 @ chain.b))
+        return dc.replace(m, turned=m.turned + wrap(now - m.turned))
+
+    # ------------------------------------------------------------ grasp
+    def _grasp(
+        self, time: float, dt: float, m: Memory, state: RobotState, mode: ModeState, chain: Chain
+    ) -> tuple[Memory, np.ndarray, np.ndarray]:
+        c = self.config
+        gripper = np.array([0.0, c.grip_force])
+        extra = np.zeros(6)
+        if m.stage == "close":
+            held = self._held(state)
+            m = dc.replace(m, odd=m.odd + dt if held else 0.0)  # here: how long both have held
+            if m.odd >= 0.4:
+                m = dc.replace(m, stage="tug", since=time, start=m.X, odd=0.0)
+            elif time - m.since > c.close_time:
+                m = self._fail(time, m, Verdict.GRASP_MISSED, self._openings(state))
+        elif m.stage == "tug":
+            pull = -(chain.f @ chain.u)  # the bar holds the hands back: force into the panel
+            tugged = tuple(bool(t or f >= c.tug_force) for t, f in zip(m.tugged, pull))
+            m = dc.replace(m, tugged=tugged)
+            moved = max(float((m.X[k][:, 3] - m.start[k][:, 3]) @ chain.u) for k in range(2))
+            if all(tugged):
+                m = dc.replace(m, stage="settle", since=time)
+            elif moved > c.tug_reach or not self._held(state):
+                detail = f"tug: {pull[0]:.1f} and {pull[1]:.1f} N, {self._openings(state)}"
+                m = self._fail(time, m, Verdict.GRASP_MISSED, detail)
+            else:
+                extra[3:] = c.tug_speed * chain.u + chain.u * min(float(np.sum(pull)), 40.0) / (2 * c.damping)
+        elif m.stage == "settle" and time - m.since > c.relax:
+            if self._held(state):
+                m = dc.replace(m, stage="held", status=Status(time, m.activation, "succeeded", detail=self._openings(state)))
+            else:
+                m = self._fail(time, m, Verdict.GRASP_MISSED, self._openings(state))
+        return m, twists(chain, None, c, extra), gripper
+
+    def _held(self, state: RobotState) -> bool:
+        """Both grippers stopped at the handle's width and press."""
+        c = self.config
+        openings = np.array([state.left_gripper, state.right_gripper])
+        forces = np.array([state.left_gripper_force, state.right_gripper_force])
+        return bool(
+            np.all(np.abs(openings - self.marker.handle_width) < c.grip_margin) and np.all(forces > 0.5 * c.grip_force)
+        )
+
+    def _openings(self, state: RobotState) -> str:
+        return (
+            f"openings {1e3 * state.left_gripper:.1f} and {1e3 * state.right_gripper:.1f} mm, "
+            f"{state.left_gripper_force:.0f} and {state.right_gripper_force:.0f} N"
+        )
+
+    # ------------------------------------------------------------ turn
+    def _turn(
+        self, time: float, dt: float, m: Memory, state: RobotState, mode: ModeState, chain: Chain
+    ) -> tuple[Memory, np.ndarray, np.ndarray]:
+        c = self.config
+        gripper = np.array([0.0, c.grip_force])
+        sense = 1.0 if mode.turn_angle >= 0 else -1.0
+        if m.stage in ("turn", "back"):
+            m = self._watch(time, dt, m, state, chain)
+        if m.stage not in ("turn", "back"):
+            return m, twists(chain, None, c, np.zeros(6)), gripper
+        if m.stage == "back":
+            sense = -sense
+        goal = mode.turn_angle if m.stage == "turn" else m.stalled_at + sense * c.back_off
+        left = sense * (goal - m.turned)
+        if m.stage == "turn" and left <= c.tolerance:
+            detail = f"{np.degrees(m.turned):.2f} deg by the hands"
+            status = Status(time, m.activation, "succeeded", detail=detail, progress=1.0, value=m.turned)
+            m = dc.replace(m, stage="there", status=status)
+            return m, twists(chain, None, c, np.zeros(6)), gripper
+        lead = sense * (m.commanded - m.turned)
+        rate = turn_rate(left, m.rate, sense * chain.torque, lead, c, dt)
+        m = dc.replace(m, rate=rate, commanded=m.commanded + sense * rate * dt)
+        progress = float(np.clip(m.turned / mode.turn_angle, 0, 1))
+        m = dc.replace(m, status=Status(time, m.activation, "running", progress=progress, value=m.turned))
+        m = self._stall(time, m, sense, left)
+        return m, twists(chain, sense * rate, c, np.zeros(6)), gripper
+
+    def _stall(self, time: float, m: Memory, sense: float, left: float) -> Memory:
+        """A stall is tried the other way: if that is free it was a stop, if it is stiff too the valve is stuck."""
+        c = self.config
+        since, angle = m.mark
+        if sense * (m.turned - angle) > c.stall_angle:
+            return dc.replace(m, mark=(time, m.turned))
+        if m.stage == "back":
+            if left <= c.tolerance:  # free the other way: try again
+                return dc.replace(m, stage="turn", rate=0.0, mark=(time, m.turned), commanded=m.turned)
+            if time - since > c.stall_time:
+                detail = f"stiff both ways at {np.degrees(m.turned):.1f} deg, {m.telemetry.torque:.1f} N m"
+                return self._fail(time, m, Verdict.STUCK, detail)
+        elif time - since > c.stall_time:
+            if m.stalls > 0 and abs(m.turned - m.stalled_at) < np.radians(2):
+                detail = f"stopped twice at {np.degrees(m.turned):.1f} deg, free the other way"
+                return self._fail(time, m, Verdict.END_STOP, detail)
+            if m.stalls >= 3:
+                return self._fail(time, m, Verdict.STUCK, f"stalled {m.stalls + 1} times")
+            return dc.replace(
+                m,
+                stage="back",
+                rate=0.0,
+                stalls=m.stalls + 1,
+                stalled_at=m.turned,
+                mark=(time, m.turned),
+                commanded=m.turned,
+            )
+        return m
+
+    def _watch(self, time: float, dt: float, m: Memory, state: RobotState, chain: Chain) -> Memory:
+        """Force trip, grasp lost, one hand carrying all, end of reach."""
+        c = self.config
+        force = np.linalg.norm(chain.f, axis=1)
+        m = dc.replace(m, tripped=m.tripped + 1 if np.max(force) > c.force_trip else 0)
+        if m.tripped >= 3:
+            verdict = Verdict.STUCK if abs(chain.torque) > 0.7 * c.torque_limit else Verdict.FAULT
+            return self._fail(time, m, verdict, f"hand forces {force[0]:.0f} and {force[1]:.0f} N")
+        openings = np.array([state.left_gripper, state.right_gripper])
+        off = np.max(np.abs(openings - self.marker.handle_width)) > 2 * c.grip_margin
+        share = chain.couples[0] / chain.torque if abs(chain.torque) > 2.0 else 0.5
+        odd = off or not 0.1 < share < 0.9
+        m = dc.replace(m, odd=m.odd + dt if odd else 0.0)
+        if m.odd > 0.5:
+            detail = f"{self._openings(state)}, left hand carries {100 * share:.0f} %"
+            return self._fail(time, m, Verdict.SLIP, detail)
+        if min(self.geometry.arm_margin(state.left_arm), self.geometry.arm_margin(state.right_arm)) < 0.02:
+            return self._fail(time, m, Verdict.REACH_LIMIT, f"arms at their limit at {np.degrees(m.turned):.1f} deg")
+        return m
+
+    # ------------------------------------------------------------ release
+    def _release(
+        self, time: float, dt: float, m: Memory, state: RobotState, mode: ModeState, chain: Chain
+    ) -> tuple[Memory, np.ndarray, np.ndarray]:
+        c = self.config
+        V = twists(chain, None, c, np.zeros(6))
+        grip = np.array([0.0, c.grip_force])
+        opened = np.array([c.opening, c.open_force])
+        if m.stage == "relax":
+            closed = min(state.left_gripper, state.right_gripper) < self.marker.handle_width + 2 * c.grip_margin
+            if not closed or time - m.since > c.relax:
+                m = dc.replace(m, stage="open", since=time)
+            return m, V, grip if closed else opened
+        if m.stage == "open":
+            wide = min(state.left_gripper, state.right_gripper) > 0.9 * c.opening
+            if wide or time - m.since > 2.0:
+                m = dc.replace(m, stage="back", since=time, start=m.X)
+            return m, V, opened
+        if m.stage == "back":
+            way = min(c.retreat, c.retreat_speed * (time - m.since))
+            X = tuple(standoff(m.start[k], self.view[side], way) for k, side in enumerate(SIDES))
+            m = self._command(m, X)
+            if way >= c.retreat:
+                status = Status(time, m.activation, "succeeded", progress=1.0, value=m.turned)
+                m = dc.replace(m, stage="away", status=status)
+        return m, np.zeros((2, 6)), opened
+
+    # ------------------------------------------------------------ common
+    def _fail(self, time: float, m: Memory, verdict: Verdict, detail: str) -> Memory:
+        return dc.replace(m, stage="failed", status=Status(time, m.activation, "failed", verdict, detail, value=m.turned))
+
+    def _move(self, dt: float, m: Memory, V: np.ndarray, chain: Chain) -> Memory:
+        """Integrates the hands' twists (about the chain's centre) into commanded poses and joints."""
+        X = []
+        for k in range(2):
+            w, v = V[k, :3], V[k, 3:]
+            R, p = m.X[k][:, :3], m.X[k][:, 3]
+            X.append(make(rotation(w * dt) @ R, p + dt * (v + np.cross(w, p - chain.c))))
+        return self._command(m, tuple(X))
+
+    def _command(self, m: Memory, X: tuple) -> Memory:
+        """Takes poses as the command where inverse kinematics reaches them; a hand that cannot stays."""
+        q, kept = list(m.q), list(m.X)
+        for k, side in enumerate(SIDES):
+            solution = self.geometry.arm_inverse(X[k], side, m.q[k])
+            if solution is not None and np.max(np.abs(solution - m.q[k])) < 0.5:
+                q[k], kept[k] = solution, X[k]
+        return dc.replace(m, X=tuple(kept), q=tuple(q))
+
+    def _telemetry(self, time: float, m: Memory, chain: Chain) -> TurnState:
+        couples = chain.couples
+        return TurnState(
+            time=time,
+            stage=m.stage,
+            angle=m.turned,
+            angle_reference=m.commanded,
+            rate=m.rate,
+            torque=chain.torque,
+            share_left=float(couples[0] / chain.torque) if abs(chain.torque) > 0.5 else 0.5,
+            force_left=chain.f[0],
+            force_right=chain.f[1],
+            moment_left=chain.m[0],
+            moment_right=chain.m[1],
+            stem_force=chain.f.sum(axis=0),
+            squeeze=float((chain.f[1] - chain.f[0]) @ chain.b / 2),
+            center=chain.c + np.array([0, 0, self.geometry.shoulder_height]),
+        )

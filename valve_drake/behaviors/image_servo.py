@@ -1,0 +1,169 @@
+"""Stage 4: image-based servoing of both hands onto the taught image of their green marks. Wrist cameras uncalibrated.
+
+The feature of a mark with centre (u, v) and area a is
+
+    s = (u, v, 1) / sqrt(a)                                                     (1)
+
+For a small plane mark and a held orientation sqrt(a) = c / Z, so s = M p / c with p the mark in the camera and M the
+camera matrix: s is LINEAR in the hand's translation. Its Jacobian J = ds/dx (x: hand translation in the hand's own
+frame) is one constant 3x3 matrix that holds intrinsics, depth and hand-eye together. It is taught once, at the
+reference, by small moves of the hand; no intrinsics and no hand-eye transform are needed.
+
+    e  = J^-1 (s - s*)        the hand's displacement from the reference, in its frame [m]    (2)
+    dx = -gain e              per image, from where the hand was when the image was taken     (3)
+
+A consequence of (1): moving straight along the camera's view only scales s, so the view direction in the hand's
+frame is -J^-1 s* normalised; stand-offs are laid along it (grasp_geometry.standoff).
+
+The orientation is held (it comes from stage 2) and the gripper stays open. [Tahri, Chaumette: normalised moments]
+"""
+
+import dataclasses as dc
+
+import numpy as np
+
+from valve_drake.behaviors.taught import TaughtReference
+from valve_drake.checks import require, require_positive
+from valve_drake.frames import make
+from valve_drake.kinematics import RobotGeometry
+from valve_drake.messages import (
+    LEFT,
+    SIDES,
+    Command,
+    HandleMark,
+    HandleMarks,
+    Mode,
+    ModeState,
+    RobotState,
+    ServoState,
+    Status,
+    Verdict,
+)
+
+
+@dc.dataclass
+class ImageServoConfig:
+    """Scenario key `image_servo`."""
+
+    gain: float = 0.5  # of (3), per image
+    speed: float = 0.06  # of the hand [m/s]
+    tolerance: float = 0.0015  # distance from the reference that counts as there [m]
+    images_in_tolerance: int = 3
+    lost_after: float = 1.0  # without a mark [s]
+    reach: float = 0.20  # farther from the start of servoing than this is a runaway [m]
+    opening: float = 0.085  # [m]
+    gripper_force: float = 40.0  # [N]
+
+    def check(self) -> None:
+        require_positive(self, "image_servo", vars(self))
+        require(self.gain < 1.0, "image_servo.gain", "< 1 (one image of delay)", self.gain)
+
+
+@dc.dataclass(frozen=True)
+class Hand:
+    """One hand's part of the memory."""
+
+    X_HG: np.ndarray  # commanded pose (3, 4)
+    start: np.ndarray  # p_HG at the beginning
+    goal: np.ndarray  # p_HG that the last image asks for
+    q: np.ndarray
+    seen: int = -1
+    seen_at: float = 0.0
+    error: np.ndarray = dc.field(default_factory=lambda: np.full(3, np.nan))
+    inside: int = 0  # images in tolerance in a row
+    past: tuple[tuple[float, np.ndarray], ...] = ()  # (time, measured p_HG), newest last
+
+
+@dc.dataclass(frozen=True)
+class Memory:
+    activation: int = -1
+    hands: dict[str, Hand] | None = None
+    status: Status = Status()
+
+
+class ImageServo:
+    """The mathematics of the stage, for both hands."""
+
+    def __init__(self, config: ImageServoConfig, geometry: RobotGeometry, taught: dict[str, TaughtReference]):
+        config.check()
+        self.config = dc.replace(config)
+        self.geometry = geometry
+        self.taught = taught
+
+    def step(
+        self, time: float, dt: float, memory: Memory, state: RobotState, mode: ModeState, marks: HandleMarks
+    ) -> tuple[Memory, Command, ServoState]:
+        """One tick of length dt -> memory (with status), command, telemetry."""
+        if mode.mode != Mode.SERVO:
+            return Memory(), Command(time=time), ServoState(time=time)
+        if memory.activation != mode.activation:
+            hands = {side: self._begin(time, state, side) for side in SIDES}
+            memory = Memory(mode.activation, hands, Status(time, mode.activation, "running"))
+        hands = {side: self._hand(time, dt, memory.hands[side], state, side, getattr(marks, side)) for side in SIDES}
+        status = memory.status
+        if status.state == "running":
+            status = self._judge(time, mode.activation, hands)
+        gripper = np.array([self.config.opening, self.config.gripper_force])
+        command = Command(
+            time=time,
+            left_arm=hands["left"].q,
+            right_arm=hands["right"].q,
+            left_gripper=gripper,
+            right_gripper=gripper,
+        )
+        enough = self.config.images_in_tolerance
+        telemetry = ServoState(
+            time=time,
+            left_error=hands["left"].error,
+            right_error=hands["right"].error,
+            left_converged=hands["left"].inside >= enough,
+            right_converged=hands["right"].inside >= enough,
+        )
+        return Memory(mode.activation, hands, status), command, telemetry
+
+    def _begin(self, time: float, state: RobotState, side: str) -> Hand:
+        q = state.left_arm if side == LEFT else state.right_arm
+        X_HG = self.geometry.arm_forward(q, side)
+        return Hand(X_HG=X_HG, start=X_HG[:, 3], goal=X_HG[:, 3], q=q, seen_at=time)
+
+    def _hand(self, time: float, dt: float, hand: Hand, state: RobotState, side: str, mark: HandleMark) -> Hand:
+        q = state.left_arm if side == LEFT else state.right_arm
+        p_now = self.geometry.arm_forward(q, side)[:, 3]
+        hand = dc.replace(hand, past=(*hand.past[-31:], (time, p_now)))
+        if mark.found and mark.sequence != hand.seen and mark.time >= hand.past[0][0]:
+            e = self.taught[side].displacement(mark.feature)
+            R = hand.X_HG[:, :3]
+            p_then = min(hand.past, key=lambda item: abs(item[0] - mark.time))[1]
+            hand = dc.replace(
+                hand,
+                seen=mark.sequence,
+                seen_at=time,
+                error=e,
+                goal=p_then - self.config.gain * (R @ e),
+                inside=hand.inside + 1 if np.linalg.norm(e) < self.config.tolerance else 0,
+            )
+        elif not mark.found and mark.sequence != hand.seen:
+            hand = dc.replace(hand, seen=mark.sequence, inside=0)
+        if time - hand.seen_at > 0.25:  # blind: stand still
+            hand = dc.replace(hand, goal=hand.X_HG[:, 3])
+        step = hand.goal - hand.X_HG[:, 3]
+        most = self.config.speed * dt
+        length = float(np.linalg.norm(step))
+        p = hand.X_HG[:, 3] + step * min(1.0, most / max(length, 1e-12))
+        X_HG = make(hand.X_HG[:, :3], p)
+        solution = self.geometry.arm_inverse(X_HG, side, hand.q)
+        if solution is None:  # at the edge of reach: stay
+            return hand
+        return dc.replace(hand, X_HG=X_HG, q=solution)
+
+    def _judge(self, time: float, activation: int, hands: dict[str, Hand]) -> Status:
+        c = self.config
+        errors = ", ".join(f"{side} {1e3 * np.linalg.norm(hands[side].error):.1f} mm" for side in SIDES)
+        for side, hand in hands.items():
+            if time - hand.seen_at > c.lost_after:
+                return Status(time, activation, "failed", Verdict.MARKER_LOST, f"{side} mark lost")
+            if np.linalg.norm(hand.X_HG[:, 3] - hand.start) > c.reach:
+                return Status(time, activation, "failed", Verdict.GRASP_MISSED, f"{side} hand ran away")
+        if all(hand.inside >= c.images_in_tolerance for hand in hands.values()):
+            return Status(time, activation, "succeeded", detail=errors, progress=1.0)
+        return Status(time, activation, "running", detail=errors)

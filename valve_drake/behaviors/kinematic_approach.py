@@ -1,0 +1,352 @@
+"""Stage 3: the arms by forward and inverse kinematics; and the two looks at rest, before and after the turn.
+
+What it does in each mode:
+    idle, search, approaches  holds the arms at home; from every good estimate in fine_approach it says where to stand
+    measure   several frames at rest -> the valve's pose in the base and the grasps (GraspPlan)
+    reach     a collision-free joint path of both arms to the stand-off before the handles, offset along the wrist
+              cameras' view; ends on arrival, or before when both green marks are large enough in the wrist images
+    verify    arms back home, several frames at rest: the angle that the camera sees decides
+    retreat   holds home
+
+Frames: frames.py. The base stands still from measure to verify.
+"""
+
+import dataclasses as dc
+from collections.abc import Callable
+
+import numpy as np
+
+from valve_drake.behaviors.grasp_geometry import (
+    StanceConfig,
+    best_arc,
+    find_stance,
+    hand_in_valve,
+    standoff,
+    turn_between,
+    turned,
+)
+from valve_drake.behaviors.joint_path import Path, find_path
+from valve_drake.checks import require, require_positive
+from valve_drake.frames import compose, inverse, planar, wrap
+from valve_drake.kinematics import RobotGeometry, lateral
+from valve_drake.messages import (
+    LEFT,
+    RIGHT,
+    SIDES,
+    Command,
+    GraspPlan,
+    HandleMarks,
+    Mode,
+    ModeState,
+    RectangleEstimate,
+    RobotState,
+    Stance,
+    Status,
+    TurnState,
+    Verdict,
+)
+from valve_drake.perception.marker import Marker
+from valve_drake.perception.rectangle_estimator import fuse
+
+
+@dc.dataclass
+class KinematicApproachConfig:
+    """Scenario key `kinematic_approach`."""
+
+    home: list[float] = dc.field(default_factory=lambda: [1.05, 0.65, -1.9, 0.0, 1.25, 0.0])  # left arm; mirrored [rad]
+    joint_speed: float = 0.9  # of the fastest joint [rad/s]
+    joint_acceleration: float = 2.0  # [rad/s^2]
+    settle: float = 0.3  # stillness before a measurement [s]
+    rest: float = 0.8  # stillness at the stand-off, in which the wrist sensors are tared [s]
+    frames: int = 6  # estimates of one measurement at rest
+    mark_ratio: float = 0.9  # sqrt(area) of the green mark over the taught one at which reaching ends
+    opening: float = 0.085  # gripper open [m]
+    gripper_force: float = 40.0  # while opening [N]
+    angle_tolerance: float = 0.035  # camera angle against the command that counts as turned [rad]
+
+    def check(self) -> None:
+        require(len(self.home) == 6, "kinematic_approach.home", "6 joint angles", self.home)
+        names = [name for name in vars(self) if name != "home"]
+        require_positive(self, "kinematic_approach", names)
+
+
+@dc.dataclass(frozen=True)
+class Memory:
+    """Everything between two steps."""
+
+    activation: int = -1
+    mode: str = ""
+    phase: str = ""
+    since: float = 0.0  # of the phase [s]
+    q: np.ndarray | None = None  # command of both arms (12,)
+    path: Path | None = None
+    looks: tuple[RectangleEstimate, ...] = ()
+    seen: int = -1  # sequence of the newest estimate used
+    stance_looks: tuple[RectangleEstimate, ...] = ()
+    stance: Stance = Stance()
+    X_OV0: np.ndarray | None = None  # the valve before the turn
+    plan: GraspPlan = GraspPlan()
+    status: Status = Status()
+
+
+CONTACT = (Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE)  # the arms belong to others
+
+
+class KinematicApproach:
+    """The mathematics of the stage.
+
+    view: each wrist camera's view direction in its hand's frame (from the taught reference).
+    is_free(X_BV, q): no contact and enough clearance with both arms at q (12,), the valve at X_BV (None: no valve).
+    reference_area: of each green mark in the taught image [px^2].
+    """
+
+    def __init__(
+        self,
+        config: KinematicApproachConfig,
+        stance: StanceConfig,
+        marker: Marker,
+        geometry: RobotGeometry,
+        view: dict[str, np.ndarray],
+        reference_area: dict[str, float],
+        is_free: Callable[[np.ndarray | None, np.ndarray], bool],
+    ):
+        config.check()
+        stance.check()
+        marker.check()
+        self.config = dc.replace(config)
+        self.stance = dc.replace(stance)
+        self.marker = dc.replace(marker)
+        self.geometry = geometry
+        self.view = view
+        self.reference_area = reference_area
+        self.is_free = is_free
+        home = np.array(config.home)
+        self.home = np.concatenate([home, home * np.array([1, -1, -1, -1, -1, -1])])
+
+    # ------------------------------------------------------------ the step
+    def step(
+        self,
+        time: float,
+        memory: Memory,
+        state: RobotState,
+        mode: ModeState,
+        estimate: RectangleEstimate,
+        marks: HandleMarks,
+        turn: TurnState,
+    ) -> tuple[Memory, Command]:
+        """One tick -> new memory (with status, stance and plan in it), command."""
+        measured = np.concatenate([state.left_arm, state.right_arm])
+        m = memory
+        if mode.activation != m.activation:
+            m = dc.replace(m, activation=mode.activation, mode=mode.mode, phase="start", since=time, looks=())
+            m = dc.replace(m, status=Status(time=time, activation=mode.activation, state="idle"))
+        if m.q is None or mode.mode in CONTACT:
+            m = dc.replace(m, q=measured, path=None)
+        if mode.mode in CONTACT:
+            return m, Command(time=time)
+        run = {Mode.MEASURE: self._measure, Mode.REACH: self._reach, Mode.VERIFY: self._verify}
+        if mode.mode in run:
+            m = run[Mode(mode.mode)](time, m, state, mode, estimate, marks, turn)
+        else:
+            if mode.mode == Mode.FINE_APPROACH:
+                m = self._watch_stance(time, m, mode, estimate)
+            elif mode.mode == Mode.SEARCH:
+                m = dc.replace(m, stance=Stance(), stance_looks=())
+            m = self._homing(time, m, None)
+        if m.path is not None:
+            m = dc.replace(m, q=m.path.sample(time))
+        gripper = np.array([self.config.opening, self.config.gripper_force])
+        return m, Command(time=time, left_arm=m.q[:6], right_arm=m.q[6:], left_gripper=gripper, right_gripper=gripper)
+
+    def _status(self, m: Memory, time: float, state: str, verdict: str = "", detail: str = "") -> Memory:
+        return dc.replace(m, status=Status(time, m.activation, state, verdict, detail))
+
+    def _homing(self, time: float, m: Memory, X_BV: np.ndarray | None) -> Memory:
+        """Brings the arms home along a free path, once per activation; m.path is the move, phase "home" on arrival."""
+        if m.phase == "start":
+            m = self._move(time, m, self.home, X_BV)
+        if m.phase == "moving" and (m.path is None or time >= m.path.end()):
+            m = dc.replace(m, phase="home", since=time)
+        return m
+
+    def _move(self, time: float, m: Memory, goal: np.ndarray, X_BV: np.ndarray | None) -> Memory:
+        """Plans a path from the present command to `goal`; phase "moving", or "blocked" if there is none."""
+        if np.max(np.abs(goal - m.q)) < 1e-6:
+            return dc.replace(m, phase="moving", path=None, since=time)
+        points = find_path(m.q, goal, self._vias(m.q, goal, X_BV), lambda q: self.is_free(X_BV, q))
+        if points is None:
+            return dc.replace(m, phase="blocked", path=None, since=time)
+        path = Path(points, time, self.config.joint_speed, self.config.joint_acceleration)
+        return dc.replace(m, phase="moving", path=path, since=time)
+
+    def _vias(self, q: np.ndarray, goal: np.ndarray, X_BV: np.ndarray | None) -> list[np.ndarray]:
+        """Hands drawn straight back from whichever end is at the valve: a way out that is nearly always free."""
+        if X_BV is None:
+            return []
+        at_valve = q if np.allclose(goal, self.home) else goal
+        out = []
+        for back in (0.10, 0.16, 0.22):
+            arms = []
+            for k, side in enumerate(SIDES):
+                X_HG = self.geometry.arm_forward(at_valve[6 * k : 6 * k + 6], side)
+                X_HG = standoff(X_HG, np.array([0.0, 0, 1]), back)
+                X_HG = X_HG + np.array([[0, 0, 0, 0], [0, 0, 0, lateral(side) * back / 2], [0, 0, 0, 0]])
+                arms.append(self.geometry.arm_inverse(X_HG, side, at_valve[6 * k : 6 * k + 6]))
+            if all(a is not None for a in arms):
+                out.append(np.concatenate(arms))
+        return out
+
+    # ------------------------------------------------------------ stance
+    def _watch_stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
+        """Where to stand, from the last few estimates; the nearer the better, so old ones are dropped."""
+        if not estimate.found or estimate.sequence == m.seen:
+            return m
+        looks = (*m.stance_looks, estimate)[-5:]
+        m = dc.replace(m, seen=estimate.sequence, stance_looks=looks)
+        fused = fuse(looks)
+        if not fused.found:
+            return m
+        base, margin = find_stance(
+            fused.X_OV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view
+        )
+        good = margin >= self.stance.margin_min
+        reason = "" if good else f"no stance holds both handles through the turn (margin {margin:.2f})"
+        return dc.replace(m, stance=Stance(time=time, found=good, base=base, margin=margin, reason=reason))
+
+    # ------------------------------------------------------------ measure
+    def _look(self, time: float, m: Memory, estimate: RectangleEstimate) -> Memory:
+        """Gathers estimates whose images were taken after `since` + settle."""
+        if estimate.found and estimate.sequence != m.seen and estimate.time >= m.since + self.config.settle:
+            m = dc.replace(m, looks=(*m.looks, estimate), seen=estimate.sequence)
+        return m
+
+    def _measure(
+        self,
+        time: float,
+        m: Memory,
+        state: RobotState,
+        mode: ModeState,
+        estimate: RectangleEstimate,
+        marks: HandleMarks,
+        turn: TurnState,
+    ) -> Memory:
+        if m.phase == "start":
+            m = self._status(dc.replace(m, phase="look", since=time), time, "running")
+        if m.phase != "look":
+            return m
+        m = self._look(time, m, estimate)
+        if len(m.looks) < self.config.frames:
+            return m
+        fused = fuse(m.looks)
+        if not fused.found:
+            return self._status(dc.replace(m, phase="end"), time, "failed", Verdict.MARKER_LOST, fused.reason)
+        X_BV = compose(inverse(planar(*state.odometry[:3])), fused.X_OV)
+        arc = best_arc(X_BV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view)
+        if arc.margin < self.stance.margin_min:
+            m = self._watch_stance(time, dc.replace(m, stance_looks=m.looks, seen=-1), mode, estimate)
+            return self._status(
+                dc.replace(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, f"stance: arm margin {arc.margin:.2f}"
+            )
+        grasps = {side: compose(X_BV, hand_in_valve(side, arc.swapped, self.marker)) for side in SIDES}
+        plan = GraspPlan(
+            time=time,
+            found=True,
+            X_BV=X_BV,
+            covariance=fused.covariance,
+            swapped=arc.swapped,
+            X_BG_left=grasps[LEFT],
+            X_BG_right=grasps[RIGHT],
+            margin=arc.margin,
+        )
+        m = dc.replace(m, phase="end", plan=plan, X_OV0=fused.X_OV)
+        detail = f"valve {np.linalg.norm(X_BV[:2, 3]):.3f} m ahead, {X_BV[2, 3]:.3f} m high, margin {arc.margin:.2f}"
+        return self._status(m, time, "succeeded", detail=detail)
+
+    # ------------------------------------------------------------ reach
+    def _reach(
+        self,
+        time: float,
+        m: Memory,
+        state: RobotState,
+        mode: ModeState,
+        estimate: RectangleEstimate,
+        marks: HandleMarks,
+        turn: TurnState,
+    ) -> Memory:
+        plan = m.plan
+        if m.phase == "start":
+            m = self._status(m, time, "running")
+            goal = self._standoff_joints(plan)
+            if goal is None:
+                return self._status(
+                    dc.replace(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, "stand-off out of reach"
+                )
+            m = self._move(time, m, goal, plan.X_BV)
+            if m.phase == "blocked":
+                return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path to the handles")
+        if m.phase == "moving":
+            arrived = m.path is None or time >= m.path.end()
+            near = all(self._mark_ratio(marks, side) >= self.config.mark_ratio for side in SIDES)
+            if arrived or near:
+                why = "at the stand-off" if arrived else "marks are large enough"
+                m = dc.replace(m, phase="rest", since=time, path=None)
+                m = self._status(m, time, "running", detail=why)
+        if m.phase == "rest" and time >= m.since + self.config.rest:
+            m = self._status(dc.replace(m, phase="end"), time, "succeeded", detail=m.status.detail)
+        return m
+
+    def _mark_ratio(self, marks: HandleMarks, side: str) -> float:
+        mark = getattr(marks, side)
+        return float(np.sqrt(mark.area / self.reference_area[side])) if mark.found else 0.0
+
+    def _standoff_joints(self, plan: GraspPlan) -> np.ndarray | None:
+        X_HB = inverse(self.geometry.X_BH())
+        arms = []
+        for side in SIDES:
+            X_BG = plan.X_BG_left if side == LEFT else plan.X_BG_right
+            near = self.geometry.arm_inverse(compose(X_HB, X_BG), side)
+            X_HG = compose(X_HB, standoff(X_BG, self.view[side], self.stance.standoff))
+            arms.append(self.geometry.arm_inverse(X_HG, side, near))
+        return None if any(a is None for a in arms) else np.concatenate(arms)
+
+    # ------------------------------------------------------------ verify
+    def _verify(
+        self,
+        time: float,
+        m: Memory,
+        state: RobotState,
+        mode: ModeState,
+        estimate: RectangleEstimate,
+        marks: HandleMarks,
+        turn: TurnState,
+    ) -> Memory:
+        if m.phase == "start":
+            m = self._status(m, time, "running")
+        if m.phase in ("start", "moving"):
+            m = self._homing(time, m, turned(m.plan.X_BV, turn.angle))
+            if m.phase == "blocked":
+                return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path home")
+        if m.phase == "home":
+            m = dc.replace(m, phase="look", since=time)
+        if m.phase != "look":
+            return m
+        m = self._look(time, m, estimate)
+        if len(m.looks) < self.config.frames:
+            return m
+        fused = fuse(m.looks)
+        m = dc.replace(m, phase="end")
+        if not fused.found or m.X_OV0 is None:
+            return self._status(m, time, "failed", Verdict.MARKER_LOST, fused.reason)
+        seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, turn.angle)
+        missing = abs(mode.turn_angle - seen)
+        detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(mode.turn_angle):.2f} deg"
+        m = dc.replace(m, status=Status(time, m.activation, "running", progress=0.0, detail=detail, value=seen))
+        state_now = "succeeded" if missing <= self.config.angle_tolerance else "failed"
+        verdict = Verdict.NONE if state_now == "succeeded" else Verdict.SLIP
+        return dc.replace(m, status=Status(time, m.activation, state_now, verdict, detail, 1.0, seen))
+
+    def seen_angle(self, X_OV0: np.ndarray, X_OV1: np.ndarray, axis_known: bool, by_hands: float) -> float:
+        """The turned angle by camera [rad]. The rectangle repeats every quarter turn, with the green marks every half:
+        the branch nearest to what the hands felt is taken, the value is the camera's."""
+        period = np.pi if axis_known else np.pi / 2
+        return by_hands + wrap(turn_between(X_OV0, X_OV1) - by_hands, period)

@@ -1,0 +1,319 @@
+"""Where the robot looks: the search for the valve, and the gaze that keeps it in view afterwards.
+
+Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base while searching.
+
+    search   The gaze (waist + neck yaw) sweeps to one end and across, the base turns by half a turn to that side, so that
+             the gaze goes on over what is new, and it sweeps back: that is a round, one for each neck pitch in
+             `pitches`. A sighting stops the sweep and is centred; it counts
+             when the last `sightings` of stage 1 agree within 3 sigma or 5 % of the distance, else the sweep goes on.
+             Fails with not_found after the last round.
+    others   The neck keeps the last known p_OV on the optical axis of the left camera, the waist comes back to zero;
+             only while driving it helps when the neck is at its end.
+             Without a sighting for `lost_after` while driving or measuring: failed with marker_lost.
+
+Sightings carry the camera's pose X_OL of their capture time: p_OV = X_OL p_LV holds in motion too. Frames: frames.py.
+"""
+
+import dataclasses as dc
+from collections.abc import Callable
+
+import numpy as np
+
+from valve_drake.checks import require, require_positive
+from valve_drake.frames import apply, wrap
+from valve_drake.messages import (
+    Command,
+    Mode,
+    ModeState,
+    RectangleEstimate,
+    RobotState,
+    Status,
+    StereoPosition,
+    Verdict,
+)
+from valve_drake.motion import follow, slew, towards
+
+HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading) in O, torso (3,) -> X_OL (3, 4)
+
+DRIVING = (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH)
+WATCHING = (*DRIVING, Mode.MEASURE)  # a marker that is lost matters
+
+
+@dc.dataclass
+class ValveSearchConfig:
+    """Scenario key `valve_search`."""
+
+    sweep_yaw: float = 1.4  # neck yaw at the ends of a sweep [rad]
+    sweep_waist: float = 0.5  # waist twist there [rad]
+    sweep_speed: float = 1.0  # of the gaze [rad/s]
+    pitches: list[float] = dc.field(default_factory=lambda: [0.15, 0.4, -0.05])  # neck pitch of each round [rad]
+    turn_speed: float = 0.8  # of the base between sweeps [rad/s]
+    turn_acceleration: float = 1.0  # [rad/s^2]
+    sightings: int = 3  # that must agree
+    spread: float = 0.05  # agreement: this share of the distance, or 3 sigma
+    confirm_time: float = 1.0  # a sighting has to be confirmed within [s]
+    skip_time: float = 0.5  # then sightings are ignored while the sweep moves on [s]
+    lost_after: float = 2.0  # without a sighting while driving or measuring [s]
+    jump: float = 0.5  # a sighting this far from the last is believed only when the old place is empty [m]
+    jump_after: float = 0.5  # for so long [s]
+    neck_speed: float = 1.5  # [rad/s]
+    waist_speed: float = 0.4  # [rad/s]
+    acceleration: float = 5.0  # of waist and neck [rad/s^2]
+    yaw_limit: float = 1.55  # +- [rad]
+    pitch_low: float = -0.45  # [rad]
+    pitch_high: float = 1.05  # [rad]
+
+    def check(self) -> None:
+        block = "valve_search"
+        require_positive(self, block, [n for n in vars(self) if n not in ("pitches", "pitch_low")])
+        require(self.pitch_low < self.pitch_high, f"{block}.pitch_low", "below pitch_high", self.pitch_low)
+        within = len(self.pitches) > 0 and all(self.pitch_low <= p <= self.pitch_high for p in self.pitches)
+        require(within, f"{block}.pitches", f"angles within [{self.pitch_low}, {self.pitch_high}]", self.pitches)
+        require(self.sweep_yaw <= self.yaw_limit, f"{block}.sweep_yaw", "at most yaw_limit", self.sweep_yaw)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Memory:
+    """Everything between two steps."""
+
+    activation: int = -1
+    since: float = 0.0  # of this activation [s]
+    result: str = "running"  # running | succeeded | failed
+    verdict: str = Verdict.NONE.value
+    detail: str = ""
+    # torso
+    torso: np.ndarray | None = None  # command [rad]
+    velocity: np.ndarray | None = None  # of the command [rad/s]
+    goal: np.ndarray | None = None  # of the previous step [rad]
+    # the marker
+    target: np.ndarray | None = None  # p_OV [m]
+    target_time: float = -np.inf  # its capture time [s]
+    capture_time: float = -np.inf  # of the newest sighting looked at [s]
+    # search
+    sweeps: int = -1  # completed across; -1: on the way to the first end
+    side: float = 1.0  # the end it is moving to
+    gaze: float = 0.0  # waist + neck yaw asked for [rad]
+    to_turn: float = 0.0  # left of the base's half turn, positive to the left [rad]
+    heading: float = 0.0  # of the base at the previous step [rad]
+    turn_rate: float = 0.0  # commanded [rad/s]
+    looks: tuple[tuple[np.ndarray, float], ...] = ()  # p_OV [m] and its sigma [m], of the last sightings
+    confirm_until: float = -np.inf  # [s]
+    ignore_until: float = -np.inf  # [s]
+
+
+def aim(
+    head_pose: HeadPose, base: np.ndarray, torso: np.ndarray, p_OV: np.ndarray, iterations: int = 2
+) -> np.ndarray:
+    """Neck pitch and yaw that bring p_OV onto the left camera's optical axis -> (2,).
+
+    Fixed-point iteration from `torso`: turn by the difference of azimuth and elevation between the axis and the line to
+    the point. Exact but for the eye's offset from the neck, so each pass divides the error by distance over offset (> 6);
+    the caller starts from its last result. Joint limits are the caller's.
+    """
+    waist, pitch, yaw = torso
+    for _ in range(iterations):
+        X_OL = head_pose(base, np.array([waist, pitch, yaw]))
+        axis, line = X_OL[:, 2], p_OV - X_OL[:, 3]
+        yaw += wrap(np.arctan2(line[1], line[0]) - np.arctan2(axis[1], axis[0]))
+        pitch += np.arctan2(axis[2], np.hypot(axis[0], axis[1])) - np.arctan2(line[2], np.hypot(line[0], line[1]))
+    return np.array([pitch, yaw])
+
+
+def agree(config: ValveSearchConfig, looks: tuple[tuple[np.ndarray, float], ...], eye: np.ndarray) -> bool:
+    """Do the last sightings show one and the same place?"""
+    if len(looks) < config.sightings:
+        return False
+    points = np.array([p for p, _ in looks])
+    mean = points.mean(axis=0)
+    allowed = max(3 * max(sigma for _, sigma in looks), config.spread * float(np.linalg.norm(mean - eye)))
+    return float(np.max(np.linalg.norm(points - mean, axis=1))) < allowed
+
+
+def step(
+    config: ValveSearchConfig,
+    memory: Memory,
+    time: float,
+    dt: float,
+    robot_state: RobotState,
+    mode: ModeState,
+    position: StereoPosition,
+    estimate: RectangleEstimate,
+    head_pose: HeadPose,
+) -> tuple[Memory, Command, Status]:
+    """One tick of length dt -> memory, command, status."""
+    m = memory
+    base = robot_state.odometry[:3]
+    if m.torso is None:
+        if len(robot_state.history) == 0:  # nothing was measured yet
+            return m, Command(time=time), Status(time=time, activation=mode.activation)
+        m = dc.replace(m, torso=robot_state.torso, goal=robot_state.torso, velocity=np.zeros(3))
+    if mode.activation != m.activation:
+        m = _begin(m, time, mode, base)
+
+    twist = None
+    if mode.mode == Mode.SEARCH:
+        m, goal = _search(config, m, time, dt, base, position, head_pose)
+        twist = np.array([0.0, m.turn_rate])
+    else:
+        m = _sight(config, m, position, estimate)
+        if mode.mode in WATCHING and m.result == "running":
+            blind = time - max(m.since, m.target_time)
+            if blind > config.lost_after:
+                m = _end(m, "failed", Verdict.MARKER_LOST, f"marker not seen for {blind:.1f} s")
+        goal = _gaze(config, m, base, robot_state.torso[0], mode.mode in DRIVING, head_pose)
+    speed = np.array([config.waist_speed, config.neck_speed, config.neck_speed])
+    torso, velocity = follow(goal, (goal - m.goal) / dt, m.torso, m.velocity, speed, config.acceleration, dt)
+    m = dc.replace(m, torso=torso, velocity=velocity, goal=goal)
+    return m, Command(time=time, torso=torso, base_twist=twist), _status(config, m, time, mode)
+
+
+def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
+    """A fresh activation: keeps the command and the last known place of the marker, forgets the rest."""
+    gaze = float(m.torso[0] + m.torso[2])
+    return Memory(
+        activation=mode.activation,
+        since=time,
+        torso=m.torso,
+        velocity=m.velocity,
+        goal=m.goal,
+        target=m.target,
+        target_time=m.target_time,
+        capture_time=m.capture_time,
+        side=1.0 if gaze >= 0 else -1.0,  # the nearer end first
+        gaze=gaze,
+        heading=float(base[2]),
+    )
+
+
+def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") -> Memory:
+    return dc.replace(m, result=result, verdict=str(verdict), detail=detail)
+
+
+def _status(config: ValveSearchConfig, m: Memory, time: float, mode: ModeState) -> Status:
+    if mode.mode != Mode.SEARCH and mode.mode not in WATCHING:
+        return Status(time=time, activation=mode.activation)
+    progress = 0.0
+    if mode.mode == Mode.SEARCH:
+        progress = 1.0 if m.result == "succeeded" else max(m.sweeps, 0) / (2 * len(config.pitches))
+    return Status(time, mode.activation, m.result, m.verdict, m.detail, progress)
+
+
+# ---------------------------------------------------------------- gaze
+
+
+def _sight(config: ValveSearchConfig, m: Memory, position: StereoPosition, estimate: RectangleEstimate) -> Memory:
+    """Takes the newest of both stages' sightings as the marker's place."""
+    if estimate.found and not (position.found and position.time > estimate.time):
+        time, X_OL, p_LV = estimate.time, estimate.X_OL, estimate.X_LV[:, 3]
+    elif position.found:
+        time, X_OL, p_LV = position.time, position.X_OL, position.p_LV
+    else:
+        return m
+    if time <= m.capture_time:
+        return m
+    m = dc.replace(m, capture_time=time)
+    p_OV = apply(X_OL, p_LV)
+    if not np.all(np.isfinite(p_OV)):  # it would stay in the memory for ever
+        return m
+    far = m.target is not None and np.linalg.norm(p_OV - m.target) > config.jump
+    if far and time - m.target_time < config.jump_after:
+        return m
+    return dc.replace(m, target=p_OV, target_time=time)
+
+
+def _gaze(
+    config: ValveSearchConfig, m: Memory, base: np.ndarray, waist: float, driving: bool, head_pose: HeadPose
+) -> np.ndarray:
+    """Torso goal that keeps the target centred; without a target the neck stays."""
+    if m.target is None:
+        return np.array([0.0, m.goal[1], m.goal[2]])
+    pitch, yaw = aim(head_pose, base, np.array([waist, m.goal[1], m.goal[2]]), m.target)
+    # What the neck cannot turn, the waist takes over, but only while the arms are folded.
+    beyond = waist + yaw - np.clip(waist + yaw, -config.sweep_yaw, config.sweep_yaw)
+    twist = float(np.clip(beyond, -config.sweep_waist, config.sweep_waist)) if driving else 0.0
+    return np.array([twist, *_neck(config, pitch, yaw)])
+
+
+def _neck(config: ValveSearchConfig, pitch: float, yaw: float) -> tuple[float, float]:
+    """What the neck can do of it."""
+    return (
+        float(np.clip(pitch, config.pitch_low, config.pitch_high)),
+        float(np.clip(yaw, -config.yaw_limit, config.yaw_limit)),
+    )
+
+
+# ---------------------------------------------------------------- search
+
+
+def _search(
+    config: ValveSearchConfig,
+    m: Memory,
+    time: float,
+    dt: float,
+    base: np.ndarray,
+    position: StereoPosition,
+    head_pose: HeadPose,
+) -> tuple[Memory, np.ndarray]:
+    """One tick of the search -> memory, torso goal."""
+    turned = wrap(float(base[2]) - m.heading)
+    m = dc.replace(m, heading=float(base[2]), to_turn=m.to_turn - turned if m.to_turn else 0.0)
+    if m.result == "running":
+        m = _look(config, m, time, position)
+    confirming = time < m.confirm_until
+    if m.looks and not confirming and m.result == "running":
+        m = dc.replace(m, looks=(), ignore_until=time + config.skip_time)
+    if confirming or m.result != "running":
+        m = dc.replace(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt))
+        if not m.looks:
+            return m, m.goal
+        neck = aim(head_pose, base, m.goal, m.looks[-1][0])
+        return m, np.array([m.goal[0], *_neck(config, *neck)])
+    return _sweep(config, m, dt)
+
+
+def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPosition) -> Memory:
+    """Takes a new sighting of both cameras, and decides whether the last ones agree."""
+    if not position.found or position.time <= max(m.capture_time, m.since) or time < m.ignore_until:
+        return m
+    p_OV = apply(position.X_OL, position.p_LV)
+    if not np.all(np.isfinite(p_OV)):
+        return m
+    sigma = float(np.sqrt(np.trace(position.covariance)))
+    looks = (*m.looks, (p_OV, sigma))[-config.sightings :]
+    if not m.looks:
+        m = dc.replace(m, confirm_until=time + config.confirm_time)
+    m = dc.replace(m, looks=looks, capture_time=position.time)
+    if not agree(config, looks, position.X_OL[:, 3]):
+        return m
+    p_OV = np.mean([p for p, _ in looks], axis=0)
+    distance = float(np.hypot(*(p_OV - position.X_OL[:, 3])[:2]))
+    m = dc.replace(m, target=p_OV, target_time=position.time)
+    return _end(m, "succeeded", detail=f"marker {distance:.2f} m away, {p_OV[2]:.2f} m high")
+
+
+def _sweep(config: ValveSearchConfig, m: Memory, dt: float) -> tuple[Memory, np.ndarray]:
+    """Moves the gaze on, or the base between two sweeps -> memory, torso goal."""
+    end = config.sweep_yaw + config.sweep_waist
+    pitch = config.pitches[max(m.sweeps, 0) // 2]
+    goal = _sweep_torso(config, m.gaze, pitch)
+    if abs(m.to_turn) > 0.05:
+        rate = towards(m.to_turn, config.turn_speed, config.turn_acceleration, dt)
+        return dc.replace(m, turn_rate=slew(m.turn_rate, rate, config.turn_acceleration * dt)), goal
+    m = dc.replace(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt), to_turn=0.0)
+    if np.max(np.abs(goal - m.torso)[1:]) > 0.1:  # the neck is still on its way, after a look aside or a new pitch
+        return m, goal
+    gaze = slew(m.gaze, m.side * end, config.sweep_speed * dt)
+    m = dc.replace(m, gaze=float(gaze))
+    if gaze == m.side * end:
+        sweeps = m.sweeps + 1
+        m = dc.replace(m, sweeps=sweeps, side=-m.side, to_turn=m.side * np.pi if sweeps % 2 == 1 else 0.0)
+        if sweeps == 2 * len(config.pitches):
+            m = _end(m, "failed", Verdict.NOT_FOUND, f"no marker in {sweeps} sweeps all round")
+            return m, goal
+    return m, _sweep_torso(config, m.gaze, pitch)
+
+
+def _sweep_torso(config: ValveSearchConfig, gaze: float, pitch: float) -> np.ndarray:
+    """Waist and neck share the gaze in proportion to their ranges."""
+    share = config.sweep_waist / (config.sweep_waist + config.sweep_yaw)
+    return np.array([share * gaze, pitch, (1 - share) * gaze])

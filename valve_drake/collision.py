@@ -1,0 +1,62 @@
+"""Would the arms touch anything? The controllers' own model of robot, valve and panel, posed as they believe it."""
+
+import numpy as np
+from pydrake.geometry import QueryObject
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+
+from valve_drake.frames import compose, make
+from valve_drake.messages import SIDES
+from valve_drake.perception.marker import Marker
+from valve_drake.stations.scene import parse
+
+FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # where the valve is put when there is none
+
+
+class CollisionModel:
+    """Robot at the base's origin with its waist at zero, and a valve that can be put anywhere.
+
+    clearance: least distance that counts as free [m].
+    """
+
+    def __init__(self, marker: Marker, clearance: float = 0.015, opening: float = 0.085):
+        builder = DiagramBuilder()
+        self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+        robot = parse(self._plant, "robot")
+        self._valve = parse(self._plant, "valve")
+        self._plant.Finalize()
+        self._diagram = builder.Build()
+        self._root = self._diagram.CreateDefaultContext()
+        self._context = self._plant.GetMyMutableContextFromRoot(self._root)
+        self._clearance = clearance
+        self._panel_depth = marker.panel_depth
+        joint = self._plant.GetJointByName
+        self._arm = [joint(f"{side}_arm_{k}", robot).position_start() for side in SIDES for k in range(1, 7)]
+        self._fingers = [joint(f"{side}_finger_{k}", robot).position_start() for side in SIDES for k in (1, 2)]
+        self._opening = opening
+
+    def _pose(self, X_BV: np.ndarray | None, q: np.ndarray) -> QueryObject:
+        """Poses this model (a copy of no plant that runs) and returns the query for it."""
+        plant, context = self._plant, self._context
+        positions = np.array(plant.GetPositions(context))
+        positions[self._arm] = q
+        positions[self._fingers] = self._opening / 2
+        plant.SetPositions(context, positions)
+        X_BP = FAR if X_BV is None else compose(X_BV, make(np.eye(3), np.array([0, 0, self._panel_depth])))
+        frame = plant.GetFrameByName("valve_axis", self._valve)
+        X_PLink = frame.GetFixedPoseInBodyFrame().inverse()
+        X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X_BP[:, :3]), X_BP[:, 3]) @ X_PLink
+        plant.SetFreeBodyPose(context, frame.body(), X)
+        return self._scene_graph.get_query_output_port().Eval(self._scene_graph.GetMyContextFromRoot(self._root))
+
+    def is_free(self, X_BV: np.ndarray | None, q: np.ndarray) -> bool:
+        """True if nothing is nearer than the clearance. X_BV: the marker in the base, None without a valve; q (12,)."""
+        return len(self._pose(X_BV, q).ComputeSignedDistancePairwiseClosestPoints(self._clearance)) == 0
+
+    def touching(self, X_BV: np.ndarray | None, q: np.ndarray) -> list[str]:
+        """Names of the pairs that are nearer than the clearance, for messages."""
+        query = self._pose(X_BV, q)
+        name = query.inspector().GetName
+        pairs = query.ComputeSignedDistancePairwiseClosestPoints(self._clearance)
+        return [f"{name(p.id_A)} - {name(p.id_B)}: {1e3 * p.distance:.0f} mm" for p in pairs]

@@ -1,0 +1,219 @@
+"""THE wiring: every block of the system and every arrow between them.
+
+`WIRES` is the figure as a list, one line an arrow; `make_diagram` adds the blocks and connects them. The reviewed list
+and drawing of each scenario lie in diagrams/ (made by `valve-drake draw`; a test keeps them current).
+"""
+
+import dataclasses as dc
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Diagram, DiagramBuilder
+
+from valve_drake import resources
+from valve_drake.behaviors.base_approach_system import BaseApproachSystem
+from valve_drake.behaviors.hybrid_rotation import HybridRotation
+from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
+from valve_drake.behaviors.image_servo import ImageServo
+from valve_drake.behaviors.image_servo_system import ImageServoSystem
+from valve_drake.behaviors.kinematic_approach import KinematicApproach
+from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
+from valve_drake.behaviors.taught import load_taught
+from valve_drake.behaviors.valve_search_system import ValveSearchSystem
+from valve_drake.camera.lens import load_head
+from valve_drake.collision import CollisionModel
+from valve_drake.kinematics import GEOMETRY
+from valve_drake.messages import SIDES, OperatorCommand
+from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
+from valve_drake.perception.handle_marker_system import HandleMarkerSystem
+from valve_drake.perception.line_fitting_system import LineFittingSystem
+from valve_drake.perception.rectangle_estimator_system import RectangleEstimatorSystem
+from valve_drake.perception.stereo_positioning_system import StereoPositioningSystem
+from valve_drake.recording.recorder_system import RecorderSystem
+from valve_drake.robot_state_system import RobotStateSystem
+from valve_drake.scenario import Scenario
+from valve_drake.stations.contract import CONTRACT
+from valve_drake.stations.simulated import make_simulated_station
+from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
+from valve_drake.supervisor.supervisor import BEHAVIORS
+from valve_drake.supervisor.supervisor_system import SupervisorSystem
+
+WIRES: tuple[tuple[str, str], ...] = (
+    # the head's eyes: stages 1 and 2
+    ("station.head_left.image", "color_segmentation.head_left_image"),
+    ("station.head_right.image", "color_segmentation.head_right_image"),
+    ("color_segmentation.segmentation", "line_fitting.segmentation"),
+    ("color_segmentation.segmentation", "stereo_positioning.segmentation"),
+    ("line_fitting.edges", "rectangle_estimator.edges"),
+    # the wrists' eyes
+    ("station.left_wrist.image", "handle_marker.left_wrist_image"),
+    ("station.right_wrist.image", "handle_marker.right_wrist_image"),
+    # joints and forces
+    *((f"station.{name}", f"robot_state.{name}") for name in RobotStateSystem.INPUTS),
+    *(
+        ("robot_state.robot_state", f"{block}.robot_state")
+        for block in ("stereo_positioning", "rectangle_estimator", *BEHAVIORS, "command_selector")
+    ),
+    # what is seen, to who acts on it
+    ("stereo_positioning.position", "valve_search.position"),
+    ("stereo_positioning.position", "base_approach.position"),
+    ("rectangle_estimator.estimate", "valve_search.estimate"),
+    ("rectangle_estimator.estimate", "base_approach.estimate"),
+    ("rectangle_estimator.estimate", "kinematic_approach.estimate"),
+    ("handle_marker.marks", "kinematic_approach.marks"),
+    ("handle_marker.marks", "image_servo.marks"),
+    # between behaviours: where to stand, what to grasp, how far it was turned
+    ("kinematic_approach.stance", "base_approach.stance"),
+    ("kinematic_approach.plan", "hybrid_rotation.plan"),
+    ("hybrid_rotation.turn", "kinematic_approach.turn"),
+    # all commands through one block to the robot
+    *((f"{block}.command", f"command_selector.{block}") for block in BEHAVIORS),
+    ("station.health", "command_selector.health"),
+    *((f"command_selector.{spec.name}", f"station.{spec.name}") for spec in CONTRACT if spec.direction == "in"),
+    # supervision
+    *((f"{block}.status", f"supervisor.{block}") for block in BEHAVIORS),
+    ("station.health", "supervisor.health"),
+    ("command_selector.report", "supervisor.selector"),
+    *(
+        ("supervisor.mode", f"{block}.mode")
+        for block in ("color_segmentation", "rectangle_estimator", "handle_marker", *BEHAVIORS, "command_selector")
+    ),
+)
+
+OPERATOR = "operator"  # the diagram's input port
+
+
+@dc.dataclass(frozen=True)
+class System:
+    """The whole system and the blocks that a runner wants to talk to."""
+
+    diagram: Diagram
+    station: Diagram
+    supervisor: SupervisorSystem
+
+
+def home(scenario: Scenario) -> np.ndarray:
+    """Both arms at home (12,)."""
+    arm = np.array(scenario.kinematic_approach.home)
+    return np.concatenate([arm, arm * np.array([1, -1, -1, -1, -1, -1])])
+
+
+def initial_commands(scenario: Scenario) -> dict[str, np.ndarray]:
+    """What the station's inputs hold before the first command."""
+    arms = home(scenario)
+    out = {spec.name: np.zeros(spec.kind) for spec in CONTRACT if spec.direction == "in"}
+    for k, side in enumerate(SIDES):
+        out[f"{side}_arm.position_command"] = arms[6 * k : 6 * k + 6]
+        out[f"{side}_gripper.position_command"] = np.array([scenario.kinematic_approach.opening])
+        out[f"{side}_gripper.force_limit"] = np.array([scenario.kinematic_approach.gripper_force])
+    return out
+
+
+def make_station(scenario: Scenario, meshcat: Meshcat | None = None) -> Diagram:
+    """The station that a resolved scenario names."""
+    return make_simulated_station(
+        scenario.simulation,
+        tuple(scenario.marker.size),
+        load_head(resources.find(scenario.head_calibration, resources.models())),
+        home(scenario),
+        scenario.kinematic_approach.opening,
+        scenario.seed,
+        meshcat,
+    )
+
+
+def make_blocks(scenario: Scenario) -> list:
+    """All blocks between the station's outputs and its inputs: the same objects for every station."""
+    head = load_head(resources.find(scenario.head_calibration, resources.models()))
+    taught = load_taught(resources.find(scenario.taught, resources.models()))
+    marker = scenario.marker
+    view = {side: taught[side].view for side in SIDES}
+    area = {side: taught[side].area for side in SIDES}
+    collision = CollisionModel(marker, opening=scenario.kinematic_approach.opening)
+    return [
+        RobotStateSystem(),
+        ColorSegmentationSystem(scenario.color_segmentation),
+        LineFittingSystem(scenario.line_fitting, head, marker, scenario.stereo_positioning),
+        StereoPositioningSystem(scenario.stereo_positioning, head, GEOMETRY.head_pose, marker),
+        RectangleEstimatorSystem(scenario.rectangle_estimator, head, GEOMETRY.head_pose, marker),
+        HandleMarkerSystem(scenario.handle_marker),
+        ValveSearchSystem(scenario.valve_search, GEOMETRY.head_pose),
+        BaseApproachSystem(scenario.base_approach),
+        KinematicApproachSystem(
+            KinematicApproach(
+                scenario.kinematic_approach, scenario.stance, marker, GEOMETRY, view, area, collision.is_free
+            )
+        ),
+        ImageServoSystem(ImageServo(scenario.image_servo, GEOMETRY, taught)),
+        HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, marker, GEOMETRY, view)),
+        CommandSelectorSystem(scenario.command_selector, initial_commands(scenario)),
+        SupervisorSystem(scenario.supervisor),
+    ]
+
+
+def make_diagram(
+    scenario: Scenario,
+    recorder: RecorderSystem | None = None,
+    *,
+    meshcat: Meshcat | None = None,
+    truth: bool = True,
+) -> System:
+    """The whole system for a resolved scenario. truth=False leaves the recorder without the `truth.*` ports."""
+    builder = DiagramBuilder()
+    station = builder.AddSystem(make_station(scenario, meshcat))
+    blocks = {block.get_name(): block for block in make_blocks(scenario)}
+    for block in blocks.values():
+        builder.AddSystem(block)
+    systems = blocks | {"station": station}
+    for source, target in WIRES:
+        (a, output), (b, port) = source.split(".", 1), target.split(".", 1)
+        builder.Connect(systems[a].GetOutputPort(output), systems[b].GetInputPort(port))
+    builder.ExportInput(systems["supervisor"].GetInputPort("operator"), OPERATOR)
+    if recorder is not None:
+        builder.AddSystem(recorder)
+        _connect_recorder(builder, recorder, systems, truth)
+    diagram = builder.Build()
+    diagram.set_name("valve_drake")
+    return System(diagram, station, systems["supervisor"])
+
+
+def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems: dict, truth: bool) -> None:
+    """Every port of the recorder is named after what it records: a station's port, a command, or block.port."""
+    station = systems["station"]
+    exported = {station.get_output_port(k).get_name() for k in range(station.num_output_ports())}
+    commands = {spec.name for spec in CONTRACT if spec.direction == "in"}
+    for k in range(recorder.num_input_ports()):
+        port = recorder.get_input_port(k)
+        name = port.get_name()
+        if name == "operator.command":
+            builder.ConnectInput(OPERATOR, port)
+        elif name in exported:
+            if truth or not name.startswith("truth."):
+                builder.Connect(station.GetOutputPort(name), port)
+        elif name in commands:
+            builder.Connect(systems["command_selector"].GetOutputPort(name), port)
+        elif not name.startswith("truth."):
+            block, output = name.split(".", 1)
+            builder.Connect(systems[block].GetOutputPort(output), port)
+
+
+def command(system: System, context: object, request: OperatorCommand) -> None:
+    """Gives the system an operator's request."""
+    system.diagram.GetInputPort(OPERATOR).FixValue(context, Value(request))
+
+
+def wiring(diagram: Diagram) -> list[str]:
+    """Every connection of a diagram as "block.port -> block.port", sorted."""
+    lines = [
+        f"{a.get_system().get_name()}.{a.get_system().get_output_port(i).get_name()} -> "
+        f"{b.get_system().get_name()}.{b.get_system().get_input_port(j).get_name()}"
+        for (b, j), (a, i) in _connections(diagram)
+    ]
+    return sorted(lines)
+
+
+def _connections(diagram: Diagram) -> list:
+    return [((target[0], int(target[1])), (source[0], int(source[1]))) for target, source in diagram.connection_map().items()]
+
+

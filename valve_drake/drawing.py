@@ -1,0 +1,134 @@
+"""The wiring of a scenario as a reviewed text list and as a drawing (SVG), both made from the built diagram."""
+
+from collections.abc import Iterable
+from html import escape
+from pathlib import Path
+
+from pydrake.systems.framework import Diagram
+
+from valve_drake.diagram import make_diagram, wiring
+from valve_drake.scenario import Scenario, resolve
+
+# Where each block stands: column, row; and its colour by kind.
+PLACES: dict[str, tuple[float, float]] = {
+    "station": (0, 3.0),
+    "robot_state": (1, 5.0),
+    "color_segmentation": (1, 1.6),
+    "handle_marker": (1, 3.6),
+    "line_fitting": (2, 1.0),
+    "stereo_positioning": (2, 2.3),
+    "rectangle_estimator": (3, 1.0),
+    "valve_search": (4, 0.8),
+    "base_approach": (4, 1.9),
+    "kinematic_approach": (4, 3.0),
+    "image_servo": (4, 4.1),
+    "hybrid_rotation": (4, 5.2),
+    "command_selector": (5.2, 3.9),
+    "supervisor": (5.2, 1.6),
+}
+KINDS = {
+    "station": "#37474f",
+    "robot_state": "#546e7a",
+    "color_segmentation": "#8e3b46",
+    "line_fitting": "#8e3b46",
+    "stereo_positioning": "#8e3b46",
+    "rectangle_estimator": "#8e3b46",
+    "handle_marker": "#3c7a3f",
+    "command_selector": "#37474f",
+    "supervisor": "#6a4c93",
+}
+BEHAVIOR = "#1f5f8b"
+WIDTH, HEIGHT, COLUMN, ROW, LEFT, TOP = 158, 46, 218, 92, 20, 70
+BUSES = {"supervisor": ("mode", "#6a4c93"), "robot_state": ("robot_state", "#546e7a")}
+
+
+def write(scenario: Scenario, name: str, folder: Path) -> list[Path]:
+    """Writes <name>.wiring.txt and <name>.svg."""
+    diagram = make_diagram(resolve(scenario)).diagram
+    folder.mkdir(parents=True, exist_ok=True)
+    out = []
+    for path, text in ((folder / f"{name}.wiring.txt", wiring_text(diagram)), (folder / f"{name}.svg", svg(diagram))):
+        path.write_text(text, encoding="utf-8")
+        out.append(path)
+    return out
+
+
+def wiring_text(diagram: Diagram) -> str:
+    """The sorted list of connections."""
+    return "\n".join(wiring(diagram)) + "\n"
+
+
+def svg(diagram: Diagram) -> str:
+    """The drawing. A block that is new has no place yet and raises KeyError: give it one in PLACES."""
+    edges: dict[tuple[str, str], list[str]] = {}
+    buses: dict[str, list[str]] = {bus: [] for bus in BUSES}
+    for line in wiring(diagram):
+        source, target = line.split(" -> ")
+        (a, port), (b, _) = source.split(".", 1), target.split(".", 1)
+        if a in BUSES and port == BUSES[a][0]:
+            buses[a].append(b)
+        else:
+            edges.setdefault((a, b), []).append(port)
+    names = {system.get_name() for system in diagram.GetSystems()}
+    width = int(LEFT * 2 + 5.2 * COLUMN + WIDTH)
+    height = int(TOP + 6.9 * ROW)
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
+        'font-family="Helvetica, Arial, sans-serif">',
+        '<defs><marker id="a" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+        '<path d="M0 0L8 4L0 8z" fill="#607d8b"/></marker></defs>',
+        f'<rect width="{width}" height="{height}" fill="#fbfbf8"/>',
+        f'<text x="{LEFT}" y="30" font-size="19" font-weight="bold" fill="#263238">valve_drake</text>',
+        f'<text x="{LEFT + 126}" y="30" font-size="13" fill="#607d8b">one arrow for all ports between two blocks; '
+        "squares read the mode (purple) and the robot's state (grey)</text>",
+    ]
+    parts += [_edge(a, b, ports) for (a, b), ports in sorted(edges.items())]
+    parts += [_block(name, [bus for bus in BUSES if name in buses[bus]]) for name in sorted(names)]
+    return "\n".join([*parts, "</svg>"]) + "\n"
+
+
+def _corner(name: str) -> tuple[float, float]:
+    column, row = PLACES[name]
+    return LEFT + column * COLUMN, TOP + row * ROW
+
+
+def _block(name: str, reads: Iterable[str]) -> str:
+    x, y = _corner(name)
+    color = KINDS.get(name, BEHAVIOR)
+    out = [
+        f'<rect x="{x:.0f}" y="{y:.0f}" width="{WIDTH}" height="{HEIGHT}" rx="8" fill="{color}"/>',
+        f'<text x="{x + WIDTH / 2:.0f}" y="{y + HEIGHT / 2 + 5:.0f}" font-size="14" fill="white" '
+        f'text-anchor="middle">{escape(name)}</text>',
+    ]
+    for k, bus in enumerate(reads):
+        out.append(
+            f'<rect x="{x + 8 + 14 * k:.0f}" y="{y - 5:.0f}" width="10" height="10" fill="{BUSES[bus][1]}" '
+            'stroke="white" stroke-width="1.5"/>'
+        )
+    return "".join(out)
+
+
+def _edge(a: str, b: str, ports: list[str]) -> str:
+    (xa, ya), (xb, yb) = _corner(a), _corner(b)
+    short = ports[0] if len(ports) == 1 else f"{len(ports)} ports"
+    style = 'fill="none" stroke="#90a4ae" stroke-width="1.6" marker-end="url(#a)"'
+    if xb > xa:
+        x0, y0, x1, y1 = xa + WIDTH, ya + HEIGHT / 2, xb, yb + HEIGHT / 2
+        bend = max(40.0, (x1 - x0) / 2)
+        path = f"M{x0:.0f} {y0:.0f}C{x0 + bend:.0f} {y0:.0f} {x1 - bend:.0f} {y1:.0f} {x1:.0f} {y1:.0f}"
+        label = (x0 + 0.32 * (x1 - x0), y0 + 0.22 * (y1 - y0) - 4)
+    elif xb == xa:
+        side = xa + WIDTH
+        y0, y1 = ya + HEIGHT / 2 + 8, yb + HEIGHT / 2 - 8
+        path = f"M{side:.0f} {y0:.0f}C{side + 46:.0f} {y0:.0f} {side + 46:.0f} {y1:.0f} {side:.0f} {y1:.0f}"
+        label = (side + 38, (y0 + y1) / 2)
+    else:  # back to an earlier column: below everything
+        low = TOP + 6.5 * ROW
+        x0, y0, x1, y1 = xa + WIDTH / 2, ya + HEIGHT, xb + WIDTH / 2, yb + HEIGHT
+        path = f"M{x0:.0f} {y0:.0f}L{x0:.0f} {low:.0f}L{x1:.0f} {low:.0f}L{x1:.0f} {y1:.0f}"
+        label = ((x0 + x1) / 2, low - 6)
+    text = (
+        f'<text x="{label[0]:.0f}" y="{label[1]:.0f}" font-size="10" fill="#78909c" '
+        f'paint-order="stroke" stroke="#fbfbf8" stroke-width="3">{escape(short)}</text>'
+    )
+    return f'<path d="{path}" {style}/>{text}'

@@ -1,0 +1,94 @@
+"""Every frame letter, axis and sign of the program, in one place.
+
+SI units and radians. Drake's monogram notation: X_AB pose of B in A, p_AB position of B's origin from A's in A,
+R_AB rotation, V_AB = [w; v], F = [torque; force].
+
+    W  world (simulation only; controllers never use it)
+    O  odometry: where the base stood at the start; what controllers use as a world. It drifts against W.
+    B  base: on the floor under the waist axis, x forward, y left, z up
+    H  chest (reference of Table 5): turns with the waist, axes as B at zero, at the shoulders' mid-point
+    L, R  head cameras: x right, y down, z forward; pixel (0, 0) is the centre of the first pixel (OpenCV)
+    A, D  left and right wrist cameras (their lens and mounting are known to nobody)
+    V  marker: origin at the rectangle's centre, x along the handles, z into the panel
+    G, K  left and right hand, at the grip point: z approach, y closing direction, x = y cross z (along the bar)
+    S, T  left and right wrist sensor: axes as the hand's, behind the grip point by GRIP_BEHIND
+
+Valve angle: positive opens = counter-clockwise seen from the robot = about -z of V.
+"""
+
+import numpy as np
+
+
+def rotation_vector(R: np.ndarray) -> np.ndarray:
+    """Axis times angle of a rotation matrix (3, 3) -> (3,), angle in [0, pi]."""
+    w = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    s, c = np.linalg.norm(w), (np.trace(R) - 1) / 2
+    if s > 1e-7:
+        return w * (np.arctan2(s, c) / s)
+    if c > 0:
+        return w
+    k = int(np.argmax(np.diag(R)))  # half a turn: the axis is the dominant column of R + I
+    axis = (R + np.eye(3))[:, k]
+    return axis * (np.pi / np.linalg.norm(axis))
+
+
+def rotation(w: np.ndarray) -> np.ndarray:
+    """exp([w]x): rotation matrix of axis times angle (3,) -> (3, 3)."""
+    angle = float(np.linalg.norm(w))
+    K = skew(np.asarray(w, float))
+    if angle < 1e-8:
+        return np.eye(3) + K + K @ K / 2
+    return np.eye(3) + np.sin(angle) / angle * K + (1 - np.cos(angle)) / angle**2 * (K @ K)
+
+
+def skew(v: np.ndarray) -> np.ndarray:
+    """[v]x with [v]x u = v cross u."""
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def rot_x(a: float) -> np.ndarray:
+    c, s = np.cos(a), np.sin(a)
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def rot_y(a: float) -> np.ndarray:
+    c, s = np.cos(a), np.sin(a)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def rot_z(a: float) -> np.ndarray:
+    c, s = np.cos(a), np.sin(a)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def make(R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """[R | p] -> (3, 4)."""
+    return np.column_stack([R, p])
+
+
+def compose(*X: np.ndarray) -> np.ndarray:
+    """X_AB X_BC ... -> (3, 4)."""
+    out = X[0]
+    for nxt in X[1:]:
+        out = make(out[:, :3] @ nxt[:, :3], out[:, :3] @ nxt[:, 3] + out[:, 3])
+    return out
+
+
+def inverse(X: np.ndarray) -> np.ndarray:
+    """X_AB -> X_BA (3, 4)."""
+    return make(X[:, :3].T, -X[:, :3].T @ X[:, 3])
+
+
+def apply(X: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Points (..., 3) moved by X."""
+    return p @ X[:, :3].T + X[:, 3]
+
+
+def planar(x: float, y: float, heading: float) -> np.ndarray:
+    """X_OB of a base on the floor -> (3, 4)."""
+    return make(rot_z(heading), np.array([x, y, 0.0]))
+
+
+def wrap(angle: float, period: float = 2 * np.pi) -> float:
+    """`angle` brought to [-period/2, period/2)."""
+    return float((angle + period / 2) % period - period / 2)

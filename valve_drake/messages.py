@@ -1,0 +1,406 @@
+"""What travels on the ports between blocks: frozen messages of numpy arrays, no pydrake.
+
+A message is never changed after it is made: its arrays are read-only copies and copying it returns
+itself, so that Drake's state copies cost nothing and a reader may keep what it has read.
+Times are seconds of the station's clock. Frames and units: frames.py.
+"""
+
+import dataclasses as dc
+import enum
+from typing import Any, Self
+
+import numpy as np
+
+LEFT, RIGHT = "left", "right"
+SIDES = (LEFT, RIGHT)
+
+
+def array(*shape: int, fill: float = 0.0, optional: bool = False) -> Any:
+    """A float64 array field of this shape; -1 is any length. `optional` fields are None by default."""
+    metadata = {"shape": shape, "optional": optional}
+    if optional:
+        return dc.field(default=None, metadata=metadata)
+    full = tuple(0 if n < 0 else n for n in shape)
+    return dc.field(default_factory=lambda: np.full(full, fill), metadata=metadata)
+
+
+def transform() -> Any:
+    """A field for a rigid transform X as its 3x4 matrix [R | p]; identity by default."""
+    return dc.field(default_factory=lambda: np.eye(3, 4), metadata={"shape": (3, 4), "optional": False})
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Message:
+    """Base of all messages. Array fields are checked for shape and made read-only."""
+
+    def __post_init__(self) -> None:
+        for name, shape, optional in _array_fields(type(self)):
+            value = getattr(self, name)
+            if value is None and optional:
+                continue
+            value = np.array(value, dtype=np.float64)
+            if value.size == 0 and -1 in shape:
+                value = value.reshape([0 if n < 0 else n for n in shape])
+            if value.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, value.shape)):
+                raise ValueError(f"{type(self).__name__}.{name} must have shape {shape}, got {value.shape}")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, memo: dict) -> Self:
+        return self
+
+
+_ARRAY_FIELDS: dict[type, list[tuple[str, tuple[int, ...], bool]]] = {}
+
+
+def _array_fields(kind: type) -> list[tuple[str, tuple[int, ...], bool]]:
+    if kind not in _ARRAY_FIELDS:
+        _ARRAY_FIELDS[kind] = [
+            (f.name, f.metadata["shape"], f.metadata["optional"]) for f in dc.fields(kind) if "shape" in f.metadata
+        ]
+    return _ARRAY_FIELDS[kind]
+
+
+# ---------------------------------------------------------------- station
+
+
+@dc.dataclass(frozen=True, eq=False)
+class CameraFrame(Message):
+    """One image, as the program sees it: `image` is what the encoded bytes `data` decode to.
+
+    `sequence` counts captures of this camera from 0; -1 means that nothing was captured yet.
+    """
+
+    camera: str = ""
+    time: float = -1.0  # of capture [s]
+    sequence: int = -1
+    image: np.ndarray = dc.field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))  # (H, W, 3) RGB
+    data: bytes = b""  # JPEG
+
+    def __post_init__(self) -> None:
+        self.image.setflags(write=False)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Health(Message):
+    """The station's own report: seconds since each device last spoke, faults by name, e-stop."""
+
+    time: float = 0.0
+    devices: tuple[str, ...] = ()
+    ages: np.ndarray = array(-1)  # [s], one for each device
+    faults: tuple[str, ...] = ()
+    estop: bool = False
+
+
+@dc.dataclass(frozen=True, eq=False)
+class RobotState(Message):
+    """All joint-side measurements of one instant, and the head's recent motion."""
+
+    time: float = 0.0
+    odometry: np.ndarray = array(5)  # x, y [m], heading [rad], forward [m/s], yaw rate [rad/s]
+    torso: np.ndarray = array(3)  # waist twist, neck pitch, neck yaw [rad]
+    left_arm: np.ndarray = array(6)  # [rad]
+    right_arm: np.ndarray = array(6)
+    left_arm_velocity: np.ndarray = array(6)  # [rad/s]
+    right_arm_velocity: np.ndarray = array(6)
+    left_arm_torque: np.ndarray = array(6)  # [N m]
+    right_arm_torque: np.ndarray = array(6)
+    left_gripper: float = 0.0  # opening between the pads [m]
+    right_gripper: float = 0.0
+    left_gripper_force: float = 0.0  # on the pads [N]
+    right_gripper_force: float = 0.0
+    left_wrench: np.ndarray = array(6)  # [torque; force] felt by the sensor, in its frame, raw
+    right_wrench: np.ndarray = array(6)
+    history: np.ndarray = array(-1, 7)  # rows, oldest first: t, x, y, heading, waist, neck pitch, neck yaw
+
+    def head_at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Base (x, y, heading) and torso angles at `time`, interpolated -> (3,), (3,)."""
+        if len(self.history) == 0:
+            return self.odometry[:3], self.torso
+        t = self.history[:, 0]
+        row = [np.interp(time, t, self.history[:, 1 + k]) for k in range(6)]
+        return np.array(row[:3]), np.array(row[3:])
+
+
+# ---------------------------------------------------------------- perception
+
+
+@dc.dataclass(frozen=True, eq=False)
+class MarkerCandidate(Message):
+    """One red region of one image; `rejected` says why it is not the marker ("" if it may be)."""
+
+    corners: np.ndarray = array(4, 2)  # coarse, in order round the contour [px of the raw image]
+    center: np.ndarray = array(2)  # centroid of the region [px]
+    area: float = 0.0  # [px^2]
+    score: float = 0.0
+    rejected: str = ""
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Segmentation(Message):
+    """What color_segmentation found in one image of one head camera."""
+
+    frame: CameraFrame = dc.field(default_factory=CameraFrame)
+    candidates: tuple[MarkerCandidate, ...] = ()  # best first, rejected ones last
+    green: np.ndarray = array(-1, 3)  # green marks: u, v [px], area [px^2]
+
+
+@dc.dataclass(frozen=True, eq=False)
+class SegmentationPair(Message):
+    """Both head cameras at one capture time."""
+
+    time: float = -1.0  # of capture [s]
+    sequence: int = -1
+    left: Segmentation = dc.field(default_factory=Segmentation)
+    right: Segmentation = dc.field(default_factory=Segmentation)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class QuadEdges(Message):
+    """Sub-pixel edge of one quadrilateral in one image, in ideal (distortion-free) coordinates."""
+
+    found: bool = False
+    points: np.ndarray = array(-1, 2)  # edge points (x', y'), normalised, undistorted
+    side: np.ndarray = array(-1)  # 0..3: the side that each point belongs to
+    sigma: float = 0.0  # standard deviation of a point along the edge's normal [px]
+    corners: np.ndarray = array(4, 2)  # intersections of the fitted lines, normalised
+    corners_px: np.ndarray = array(4, 2)  # the same in the raw image [px]
+    center_px: np.ndarray = array(2)  # centroid of the coloured area in the raw image [px]
+    green: np.ndarray = array(-1, 2)  # green marks (x', y'), normalised
+    reason: str = ""  # why nothing was found
+
+
+@dc.dataclass(frozen=True, eq=False)
+class MarkerEdges(Message):
+    time: float = -1.0
+    sequence: int = -1
+    left: QuadEdges = dc.field(default_factory=QuadEdges)
+    right: QuadEdges = dc.field(default_factory=QuadEdges)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class StereoPosition(Message):
+    """Stage 1: the marker's centre."""
+
+    time: float = -1.0
+    sequence: int = -1
+    found: bool = False
+    p_LV: np.ndarray = array(3)  # in the left head camera [m]
+    covariance: np.ndarray = array(3, 3)  # of p_LV [m^2]
+    X_OL: np.ndarray = transform()  # the left head camera in odometry at `time`
+    reason: str = ""
+
+
+@dc.dataclass(frozen=True, eq=False)
+class RectangleEstimate(Message):
+    """Stage 2: the marker's pose.
+
+    covariance: of (theta, dp) in R = R0 exp([theta]x), p = p0 + dp: theta in V, dp in L [rad^2, m^2].
+    ambiguity: how much worse the mirrored candidate fits, as a difference of chi^2 (large is good).
+    axis_known: the green marks or the track say which of the rectangle's axes is X.
+    """
+
+    time: float = -1.0
+    sequence: int = -1
+    found: bool = False
+    method: str = ""
+    cameras: int = 0  # 1 or 2 cameras took part
+    X_LV: np.ndarray = transform()
+    covariance: np.ndarray = array(6, 6)
+    X_LV_other: np.ndarray = transform()  # the other candidate
+    ambiguity: float = 0.0
+    residual_px: float = 0.0
+    axis_known: bool = False
+    corners_left: np.ndarray = array(-1, 2)  # [px of the raw image]
+    corners_right: np.ndarray = array(-1, 2)
+    X_OL: np.ndarray = transform()
+    reason: str = ""
+
+
+@dc.dataclass(frozen=True, eq=False)
+class HandleMark(Message):
+    """The green mark in one wrist image. feature = (u, v, 1) / sqrt(area): see image_servo."""
+
+    time: float = -1.0
+    sequence: int = -1
+    found: bool = False
+    frame: CameraFrame = dc.field(default_factory=CameraFrame)
+    center: np.ndarray = array(2)  # [px]
+    area: float = 0.0  # of the fitted quadrilateral [px^2]
+    corners: np.ndarray = array(-1, 2)  # [px]
+    feature: np.ndarray = array(3)
+    reason: str = ""
+
+
+@dc.dataclass(frozen=True, eq=False)
+class HandleMarks(Message):
+    time: float = -1.0
+    left: HandleMark = dc.field(default_factory=HandleMark)
+    right: HandleMark = dc.field(default_factory=HandleMark)
+
+
+# ---------------------------------------------------------------- behaviours and supervision
+
+
+class Mode(enum.StrEnum):
+    """What the robot is doing. The supervisor alone changes it."""
+
+    IDLE = "idle"
+    SEARCH = "search"
+    ROUGH_APPROACH = "rough_approach"
+    FINE_APPROACH = "fine_approach"
+    MEASURE = "measure"
+    REACH = "reach"
+    SERVO = "servo"
+    GRASP = "grasp"
+    TURN = "turn"
+    RELEASE = "release"
+    VERIFY = "verify"
+    RETREAT = "retreat"
+    DONE = "done"
+    FAILED = "failed"
+    STOPPED = "stopped"
+
+
+class Verdict(enum.StrEnum):
+    """How a run ended; NONE while it is under way."""
+
+    NONE = ""
+    TURNED = "turned"
+    END_STOP = "end_stop"
+    STUCK = "stuck"
+    SLIP = "slip"
+    REACH_LIMIT = "reach_limit"
+    NOT_FOUND = "not_found"
+    MARKER_LOST = "marker_lost"
+    GRASP_MISSED = "grasp_missed"
+    TIMEOUT = "timeout"
+    FAULT = "fault"
+    STOPPED = "stopped"
+
+
+@dc.dataclass(frozen=True, eq=False)
+class OperatorCommand(Message):
+    """What a person asks for; a new `sequence` makes it a new request. angle > 0 [rad]."""
+
+    sequence: int = -1
+    command: str = ""  # open | close | stop | reset
+    angle: float = np.pi / 2
+
+
+@dc.dataclass(frozen=True, eq=False)
+class ModeState(Message):
+    """The supervisor's word to all blocks. `activation` counts entries into a mode: a behaviour
+    that sees a new one starts afresh, and its Status carries the number back."""
+
+    time: float = 0.0
+    mode: str = Mode.IDLE.value
+    activation: int = 0
+    since: float = 0.0  # when this mode was entered [s]
+    attempt: int = 0  # retries of this mode so far
+    turn_angle: float = 0.0  # commanded turn, positive opens (counter-clockwise seen from the robot) [rad]
+    verdict: str = Verdict.NONE.value
+    reason: str = ""
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Status(Message):
+    """What a behaviour says of its present activation."""
+
+    time: float = 0.0
+    activation: int = -1
+    state: str = "idle"  # idle | running | succeeded | failed
+    verdict: str = Verdict.NONE.value  # why it failed
+    detail: str = ""  # one line for people
+    progress: float = 0.0  # 0..1
+    value: float = 0.0  # what the behaviour is about: the turned angle in turn and verify [rad]
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Command(Message):
+    """What a behaviour wants of the robot. None: this behaviour does not ask for that group."""
+
+    time: float = 0.0
+    base_twist: np.ndarray | None = array(2, optional=True)  # forward [m/s], yaw rate [rad/s]
+    torso: np.ndarray | None = array(3, optional=True)  # [rad]
+    left_arm: np.ndarray | None = array(6, optional=True)  # [rad]
+    right_arm: np.ndarray | None = array(6, optional=True)
+    left_gripper: np.ndarray | None = array(2, optional=True)  # opening [m], force limit [N]
+    right_gripper: np.ndarray | None = array(2, optional=True)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class GraspPlan(Message):
+    """What kinematic_approach measured at rest and means to do: the valve in the base, and the grasps.
+
+    A hand's pose in V is constant while the valve turns, since V turns with it. `swapped`: the left hand
+    takes the handle at +x of V instead of -x.
+    """
+
+    time: float = -1.0
+    found: bool = False
+    X_BV: np.ndarray = transform()
+    covariance: np.ndarray = array(6, 6)  # of X_BV, as in RectangleEstimate with L replaced by B
+    swapped: bool = False
+    X_BG_left: np.ndarray = transform()  # grasps
+    X_BG_right: np.ndarray = transform()
+    margin: float = 0.0  # least arm margin over the whole turn, 1 is comfortable
+
+
+@dc.dataclass(frozen=True, eq=False)
+class ServoState(Message):
+    """Image servoing of both hands; error is the hand's estimated distance from the reference, in its frame."""
+
+    time: float = 0.0
+    left_error: np.ndarray = array(3)  # [m]
+    right_error: np.ndarray = array(3)
+    left_converged: bool = False
+    right_converged: bool = False
+
+
+@dc.dataclass(frozen=True, eq=False)
+class TurnState(Message):
+    """The closed chain of both hands and the valve, as hybrid_rotation sees it.
+
+    Wrenches are felt by the hands, in B, without gravity and bias. u is the valve's axis towards the robot.
+    """
+
+    time: float = 0.0
+    stage: str = ""
+    angle: float = 0.0  # turned since the grasp, by the line between the hands [rad]
+    angle_reference: float = 0.0
+    rate: float = 0.0  # [rad/s]
+    torque: float = 0.0  # that the hands put on the valve about u [N m]
+    share_left: float = 0.5  # the left hand's part of it
+    force_left: np.ndarray = array(3)  # [N]
+    force_right: np.ndarray = array(3)
+    moment_left: np.ndarray = array(3)  # at the grip point [N m]
+    moment_right: np.ndarray = array(3)
+    stem_force: np.ndarray = array(3)  # sum of both: the load on the stem beyond the couple [N]
+    squeeze: float = 0.0  # along the bar, positive compresses it [N]
+    center: np.ndarray = array(3)  # of the hands, in B [m]
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Stance(Message):
+    """Where the base should stand so that both handles can be held through the whole turn."""
+
+    time: float = -1.0  # capture time of the estimate that it was computed from [s]
+    found: bool = False
+    base: np.ndarray = array(3)  # x, y [m], heading [rad] in O
+    margin: float = 0.0  # smallest normalised joint margin on the way, 0..1
+    reason: str = ""
+
+
+@dc.dataclass(frozen=True, eq=False)
+class SelectorReport(Message):
+    """What command_selector did to the command of this tick."""
+
+    time: float = 0.0
+    source: tuple[str, ...] = ()  # block that each group was taken from ("hold" when held)
+    limited: tuple[str, ...] = ()  # what was changed, e.g. "left_arm.velocity"
+    refused: tuple[str, ...] = ()  # what was refused, e.g. "base: not finite"
+    tripped: tuple[str, ...] = ()  # hands whose force was above the trip since this mode was entered

@@ -1,0 +1,322 @@
+"""Finds what may be the red marker, and the green marks, in one image.
+
+Red is found by LOCAL contrast: Lab's a* against its mean over a small and a large neighbourhood, at half resolution.
+Absolute hues fail with the white balance; a mean over one neighbourhood alone fails on a marker larger than it.
+Every region is then cut out at full resolution on the linear opponent channel 2R - G - B, halfway between its
+inside and its surroundings, and judged by shape: a convex quadrilateral with even surroundings. Nothing is dropped
+silently: a candidate carries the reason for its rejection.
+"""
+
+import dataclasses as dc
+
+import cv2
+import numpy as np
+
+from valve_drake.checks import require, require_in
+from valve_drake.messages import MarkerCandidate, Mode
+from valve_drake.perception.marker import NEXT
+
+_RED = np.array([[2.0, -1.0, -1.0]], np.float32) / 4  # opponent channels of RGB; / 4 keeps them within int8
+_GREEN = np.array([[-1.0, 2.0, -1.0]], np.float32) / 4
+
+
+_EVERY = {mode: 1 for mode in ("search", "rough_approach", "fine_approach", "measure", "verify")}
+_EVERY |= {mode: 8 for mode in ("reach", "servo", "grasp", "turn", "release", "retreat")}
+_EVERY |= {mode: 0 for mode in ("idle", "done", "failed", "stopped")}
+
+
+def check_every(every: dict[str, int], key: str) -> None:
+    """`every` maps names of modes to whole numbers >= 0."""
+    modes = [mode.value for mode in Mode]
+    for mode, n in every.items():
+        require(mode in modes, key, f"keyed by modes ({', '.join(modes)})", mode)
+        require(isinstance(n, int) and not isinstance(n, bool) and n >= 0, f"{key}.{mode}", "a whole number >= 0", n)
+
+
+@dc.dataclass
+class ColorSegmentationConfig:
+    min_contrast: float = 9.0  # of a* against the neighbourhood, to look closer [Lab units]
+    min_opponent: float = 12.0  # of 2R - G - B (a quarter of it) between inside and surroundings [grey levels]
+    small_box: int = 61  # neighbourhoods whose mean is compared with [px of the full image]
+    large_box: int = 301
+    min_area: float = 60.0  # of a marker [px^2]
+    min_green_area: float = 12.0  # of a green mark [px^2]
+    min_fill: float = 0.86  # region's area over its quadrilateral's, and the inverse
+    max_aspect: float = 3.2  # long side over short side in the image (65 deg oblique makes 2.4 of a square)
+    border: int = 3  # a region this near to the image's border is cut off [px]
+    max_candidates: int = 12  # regions judged per image, largest contrast x area first
+    follow: bool = True  # look only round the last candidates, and everywhere if they are gone
+    full_every: int = 4  # and everywhere at every n-th look
+    every: dict[str, int] = dc.field(default_factory=lambda: dict(_EVERY))  # mode -> look every n-th step, 0 = never
+
+    def check(self) -> None:
+        for name, low, high in (
+            ("min_contrast", 1, 100),
+            ("min_opponent", 1, 200),
+            ("small_box", 5, 2000),
+            ("large_box", 5, 4000),
+            ("min_area", 9, 1e6),
+            ("min_green_area", 4, 1e6),
+            ("min_fill", 0.5, 1),
+            ("max_aspect", 1, 20),
+            ("border", 0, 100),
+            ("max_candidates", 1, 1000),
+            ("full_every", 1, 1000),
+        ):
+            require_in(getattr(self, name), low, high, f"color_segmentation.{name}")
+        check_every(self.every, "color_segmentation.every")
+        require(self.large_box > self.small_box, "color_segmentation.large_box", "> small_box", self.large_box)
+
+
+@dc.dataclass(frozen=True)
+class Region:
+    """One coloured region cut out at full resolution."""
+
+    contour: np.ndarray  # (n, 2) of its outline, pixel centres [px]
+    center: np.ndarray  # (2,) centroid [px]
+    area: float  # [px^2]
+    contrast: float  # of the opponent channel, inside against surroundings [grey levels]
+    evenness: float  # share of the ring round the region that is clearly not of its colour
+
+
+def segment(
+    image: np.ndarray, config: ColorSegmentationConfig, roi: tuple[int, int, int, int] | None = None
+) -> tuple[tuple[MarkerCandidate, ...], np.ndarray]:
+    """Candidates for the marker (best first, rejected last), and green marks (n, 3): u, v [px], area [px^2].
+
+    image: (H, W, 3) uint8 RGB. roi: x, y, width, height [px]: look only there.
+    """
+    x, y, w, h = roi if roi else (0, 0, image.shape[1], image.shape[0])
+    part = image[y : y + h, x : x + w]
+    a = _half_a(part)
+    regions, red = _regions(image, a, (x, y), config, "red")
+    red += [_judge(image, region, config) for region in regions]
+    accepted = sorted((c for c in red if not c.rejected), key=lambda c: -c.score)
+    rejected = sorted((c for c in red if c.rejected), key=lambda c: -c.area)
+    return (*accepted, *rejected), _green_marks(a, (x, y), config)
+
+
+def green_regions(image: np.ndarray, config: ColorSegmentationConfig) -> list[Region]:
+    """Green regions cut out at full resolution, for the wrist cameras."""
+    return _regions(image, _half_a(image), (0, 0), config, "green")[0]
+
+
+def quadrilateral(contour: np.ndarray) -> np.ndarray | None:
+    """The four corners that an outline (n, 2) simplifies to, clockwise as seen, or None -> (4, 2) [px]."""
+    hull = cv2.convexHull(contour.astype(np.int32).reshape(-1, 1, 2))
+    length = cv2.arcLength(hull, True)
+    for share in (0.03, 0.045, 0.06, 0.08, 0.02):
+        corners = cv2.approxPolyDP(hull, share * length, True)[:, 0].astype(float)
+        if len(corners) == 4:
+            return corners if _signed_area(corners) > 0 else corners[::-1]
+    return None
+
+
+def polygon_area(corners: np.ndarray) -> float:
+    return abs(_signed_area(corners))
+
+
+def _signed_area(p: np.ndarray) -> float:
+    """Positive when clockwise as seen in an image (v down)."""
+    q = p[NEXT] if len(p) == 4 else np.roll(p, -1, 0)
+    return float(p[:, 0] @ q[:, 1] - p[:, 1] @ q[:, 0]) / 2
+
+
+def _half_a(image: np.ndarray) -> np.ndarray:
+    """a* of the image at half resolution, (H // 2, W // 2) uint8."""
+    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(cv2.cvtColor(small, cv2.COLOR_RGB2LAB)[:, :, 1])
+
+
+def _contrast(a: np.ndarray, config: ColorSegmentationConfig, sign: int) -> np.ndarray:
+    """Largest excess of a* (sign > 0), or lack of it, over the means of both neighbourhoods; uint8."""
+    out = None
+    for box in (config.small_box, config.large_box):
+        side = (box // 2) | 1
+        # A neighbourhood larger than the image would read past its reflection.
+        side = min(side, 2 * min(a.shape) - 1)
+        mean = cv2.blur(a, (side, side), borderType=cv2.BORDER_REFLECT)
+        excess = cv2.subtract(a, mean) if sign > 0 else cv2.subtract(mean, a)
+        out = excess if out is None else cv2.max(out, excess)
+    return cv2.blur(out, (3, 3))
+
+
+def _outlines(mask: np.ndarray) -> list[np.ndarray]:
+    return list(cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0])
+
+
+def _regions(
+    image: np.ndarray, a: np.ndarray, origin: tuple[int, int], config: ColorSegmentationConfig, color: str
+) -> tuple[list[Region], list[MarkerCandidate]]:
+    """Regions cut out at full resolution, and those that their coarse outline already rules out."""
+    contrast = _contrast(a, config, +1 if color == "red" else -1)
+    seeds, ruled_out = [], []
+    for outline in _outlines(cv2.compare(contrast, config.min_contrast, cv2.CMP_GT)):
+        bx, by, bw, bh = cv2.boundingRect(outline)
+        if bw * bh * 4 < config.min_area or min(bw, bh) < 2:
+            continue
+        reason = _coarse_reason(outline, (bx, by, bw, bh), a.shape, config)
+        if reason and color == "red":
+            low = np.array([bx, by], float) * 2 + origin
+            size = np.array([bw, bh], float) * 2
+            corners = low + size * [[0, 0], [1, 0], [1, 1], [0, 1]]
+            area = 4 * cv2.contourArea(outline)
+            ruled_out.append(MarkerCandidate(corners=corners, center=low + size / 2, area=area, rejected=reason))
+        elif not reason or reason == "border":
+            seeds.append((cv2.sumElems(contrast[by : by + bh, bx : bx + bw])[0], (bx, by, bw, bh)))
+    seeds.sort(key=lambda seed: -seed[0])
+    found: list[Region] = []
+    for _, (bx, by, bw, bh) in seeds[: config.max_candidates]:
+        box = (origin[0] + 2 * bx, origin[1] + 2 * by, 2 * bw, 2 * bh)
+        local = contrast[by : by + bh, bx : bx + bw]
+        region = _cut_out(image, box, local, config, _RED if color == "red" else _GREEN)
+        if region is not None and not any(np.abs(region.center - r.center).max() < 1.5 for r in found):
+            found.append(region)
+    return found, ruled_out
+
+
+def _coarse_reason(
+    outline: np.ndarray, box: tuple[int, int, int, int], shape: tuple[int, ...], config: ColorSegmentationConfig
+) -> str:
+    """Why a half-resolution outline cannot be the marker, or ""; generous, the fine outline decides."""
+    x, y, w, h = box
+    if x == 0 or y == 0 or x + w == shape[1] or y + h == shape[0]:
+        return "border"
+    area = cv2.contourArea(outline) + cv2.arcLength(outline, True) / 2 + 1
+    hull = cv2.convexHull(outline)
+    full = cv2.contourArea(hull) + cv2.arcLength(hull, True) / 2 + 1
+    if area < 0.65 * full:
+        return f"fill: {area / full:.2f}"
+    (_, (long, short), _) = cv2.minAreaRect(hull)
+    long, short = max(long, short) + 1, min(long, short) + 1
+    if long > 1.5 * config.max_aspect * short:
+        return f"aspect: {long / short:.1f}"
+    return ""
+
+
+def _cut_out(
+    image: np.ndarray,
+    box: tuple[int, int, int, int],
+    contrast: np.ndarray,
+    config: ColorSegmentationConfig,
+    opponent: np.ndarray,
+) -> Region | None:
+    """The region of a box at full resolution, on the linear opponent channel.
+
+    contrast: the half-resolution contrast within the box, whose upper half marks the region's inside.
+    """
+    x, y, w, h = box
+    pad = 4 + max(w, h) // 5
+    x0, y0 = max(x - pad, 0), max(y - pad, 0)
+    x1, y1 = min(x + w + pad, image.shape[1]), min(y + h + pad, image.shape[0])
+    channel = cv2.transform(image[y0:y1, x0:x1].astype(np.float32), opponent)
+    strong = cv2.compare(contrast, 0.6 * float(contrast.max()), cv2.CMP_GT)
+    inner = cv2.resize(strong, (w, h), interpolation=cv2.INTER_NEAREST)
+    inside = np.zeros(channel.shape, np.uint8)
+    # Odd image sizes leave the last row or column out of the half-size image.
+    ih, iw = min(h, inside.shape[0] - (y - y0)), min(w, inside.shape[1] - (x - x0))
+    inside[y - y0 : y - y0 + ih, x - x0 : x - x0 + iw] = inner[:ih, :iw]
+    around = cv2.bitwise_not(cv2.dilate(inside, np.ones((5, 5), np.uint8)))
+    around[2:-2, 2:-2] &= cv2.compare(channel[2:-2, 2:-2], cv2.mean(channel, inside)[0], cv2.CMP_LT)
+    high, low = cv2.mean(channel, inside)[0], cv2.mean(channel, around)[0]
+    if high - low < 0.5 * config.min_opponent:
+        return None
+    middle = (high + low) / 2
+    mask = cv2.compare(channel, middle, cv2.CMP_GT)
+    seed = _outline_with_most_of(mask, inside)
+    if seed is None:
+        return None
+    contour = seed[:, 0].astype(float)
+    area = cv2.contourArea(seed) + cv2.arcLength(seed, True) / 2 + 1  # the outline runs through pixel centres
+    m = cv2.moments(seed)
+    center = np.array([m["m10"], m["m01"]]) / m["m00"] if m["m00"] > 0 else contour.mean(0)
+    # The ring begins outside the blur of the edge.
+    region = np.zeros(mask.shape, np.uint8)
+    cv2.drawContours(region, [seed], -1, 255, -1)
+    near = cv2.dilate(region, np.ones((5, 5), np.uint8))
+    ring = cv2.subtract(cv2.dilate(near, np.ones((5, 5), np.uint8)), near)
+    ringed = cv2.countNonZero(ring)
+    clear = cv2.countNonZero(cv2.bitwise_and(ring, cv2.compare(channel, middle, cv2.CMP_LT)))
+    inside_mean = cv2.mean(channel, cv2.erode(region, np.ones((3, 3), np.uint8)) if area > 100 else region)[0]
+    ring_mean = cv2.mean(channel, ring)[0]
+    offset = np.array([x0, y0], float)
+    return Region(
+        contour=contour + offset,
+        center=center + offset,
+        area=float(area),
+        contrast=float(inside_mean - ring_mean),
+        evenness=clear / ringed if ringed else 0.0,
+    )
+
+
+def _outline_with_most_of(mask: np.ndarray, inside: np.ndarray) -> np.ndarray | None:
+    """Of the outlines in `mask`, the one whose filled area holds most of `inside`."""
+    outlines = _outlines(mask)
+    if not outlines:
+        return None
+    if len(outlines) == 1:
+        return outlines[0]
+    best, most = None, 0.0
+    for outline in sorted(outlines, key=cv2.contourArea, reverse=True)[:3]:
+        x, y, w, h = cv2.boundingRect(outline)
+        filled = np.zeros((h, w), np.uint8)
+        cv2.drawContours(filled, [outline], -1, 255, -1, offset=(-x, -y))
+        held = cv2.countNonZero(cv2.bitwise_and(filled, inside[y : y + h, x : x + w]))
+        if held > most:
+            best, most = outline, held
+    return best
+
+
+def _judge(image: np.ndarray, region: Region, config: ColorSegmentationConfig) -> MarkerCandidate:
+    """Judges the shape of a region."""
+    low, high = region.contour.min(0), region.contour.max(0)
+    corners = quadrilateral(region.contour)
+    height, width = image.shape[:2]
+    rejected, score = "", 0.0
+    if region.area < config.min_area:
+        rejected = f"small: {region.area:.0f} px^2"
+    elif (low < config.border).any() or high[0] >= width - config.border or high[1] >= height - config.border:
+        rejected = "border"
+    elif region.contrast < config.min_opponent:
+        rejected = f"contrast: {region.contrast:.0f}"
+    elif region.evenness < 0.8:
+        rejected = f"surroundings: {region.evenness:.2f} clear"
+    elif corners is None:
+        rejected = "corners: not four"
+    else:
+        sides = np.linalg.norm(corners[NEXT] - corners, axis=1)
+        # Half a pixel all round: the corners are pixel centres of the outline.
+        quad_area = polygon_area(corners) + sides.sum() / 2 + 1
+        fill = min(region.area / quad_area, quad_area / region.area)
+        # Blur rounds the corners of a small region.
+        least = config.min_fill - min(1.5 / np.sqrt(region.area), 0.1)
+        long, short = max(sides[0] + sides[2], sides[1] + sides[3]), min(sides[0] + sides[2], sides[1] + sides[3])
+        if fill < least:
+            rejected = f"fill: {fill:.2f}"
+        elif long > config.max_aspect * short:
+            rejected = f"aspect: {long / max(short, 1e-9):.1f}"
+        elif max(abs(sides[0] - sides[2]), abs(sides[1] - sides[3])) > 0.35 * long / 2 + 3:
+            rejected = "sides: opposite ones differ"
+        else:
+            score = fill * region.evenness * min(region.contrast / 60, 1.0) * float(np.sqrt(region.area))
+    if corners is None:
+        corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    return MarkerCandidate(corners=corners, center=region.center, area=region.area, score=score, rejected=rejected)
+
+
+def _green_marks(a: np.ndarray, origin: tuple[int, int], config: ColorSegmentationConfig) -> np.ndarray:
+    """Centres of small green regions, weighted by contrast, from the half-resolution a*; (n, 3)."""
+    contrast = _contrast(a, config, -1)
+    marks = []
+    for outline in _outlines(cv2.compare(contrast, config.min_contrast, cv2.CMP_GT)):
+        x, y, w, h = cv2.boundingRect(outline)
+        box = contrast[y : y + h, x : x + w]
+        core = cv2.threshold(box, float(box.max()) / 2, 255, cv2.THRESH_TOZERO)[1]
+        area = 4.0 * cv2.countNonZero(core)
+        if area >= config.min_green_area:
+            m = cv2.moments(core)
+            # Half-size pixel k covers full pixels 2k and 2k + 1.
+            u, v = 2 * (x + m["m10"] / m["m00"]) + 0.5, 2 * (y + m["m01"] / m["m00"]) + 0.5
+            marks.append((area, u + origin[0], v + origin[1]))
+    marks.sort(reverse=True)
+    return np.array([(u, v, area) for area, u, v in marks[:32]]).reshape(-1, 3)

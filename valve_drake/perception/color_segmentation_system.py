@@ -1,0 +1,91 @@
+"""color_segmentation on ports.
+
+| port | direction | type |
+|---|---|---|
+| head_left_image | in | CameraFrame |
+| head_right_image | in | CameraFrame |
+| mode | in | ModeState |
+| segmentation | out | SegmentationPair |
+"""
+
+import dataclasses as dc
+from typing import Any
+
+from valve_drake.messages import CameraFrame, MarkerCandidate, Mode, ModeState, Segmentation, SegmentationPair
+from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
+from valve_drake.ports import Block, Inputs
+
+_Box = tuple[int, int, int, int]
+
+
+@dc.dataclass(frozen=True)
+class _Memory:
+    idle: int = 1 << 30  # steps since the last look
+    sequence: int = -1
+    looks: int = 0
+    boxes: tuple[_Box | None, _Box | None] = (None, None)  # where the candidates were, in each image
+
+
+class ColorSegmentationSystem(Block):
+    """Looks at both head images of one capture time, as often as the mode asks (config.every); else holds."""
+
+    INPUTS = {"head_left_image": CameraFrame, "head_right_image": CameraFrame, "mode": ModeState}
+    OUTPUTS = {"segmentation": SegmentationPair}
+
+    def __init__(
+        self,
+        config: ColorSegmentationConfig,
+        name: str = "color_segmentation",
+        period: float = 1 / 8,
+        delay: float = 1 / 128,
+    ):
+        config.check()
+        self._config = config
+        super().__init__(name, period=period, slot=1, delay=delay)
+
+    def initial(self) -> _Memory:
+        return _Memory()
+
+    def step(self, time: float, inputs: Inputs, memory: _Memory) -> tuple[_Memory, dict[str, Any]]:
+        state = inputs.mode
+        every = self._config.every.get(state.mode, 0) if state is not None else 0
+        memory = dc.replace(memory, idle=memory.idle + 1)
+        if every == 0 or memory.idle < every:
+            return memory, {}
+        left, right = inputs.head_left_image, inputs.head_right_image
+        if left is None or right is None or left.sequence < 0 or right.sequence < 0 or left.time != right.time:
+            return memory, {}
+        if left.sequence == memory.sequence:
+            return memory, {}
+        follow = self._config.follow and state.mode != Mode.SEARCH and (memory.looks + 1) % self._config.full_every
+        seen, boxes = [], []
+        for frame, box in zip((left, right), memory.boxes):
+            one, box = self._look(frame, box if follow else None)
+            seen.append(one)
+            boxes.append(box)
+        pair = SegmentationPair(time=left.time, sequence=left.sequence, left=seen[0], right=seen[1])
+        memory = _Memory(idle=0, sequence=left.sequence, looks=memory.looks + 1, boxes=tuple(boxes))
+        return memory, {"segmentation": pair}
+
+    def _look(self, frame: CameraFrame, box: _Box | None) -> tuple[Segmentation, _Box | None]:
+        candidates, green = segment(frame.image, self._config, box)
+        if box is not None and not any(not c.rejected for c in candidates):
+            candidates, green = segment(frame.image, self._config)
+        accepted = [c for c in candidates if not c.rejected]
+        return Segmentation(frame=frame, candidates=candidates, green=green), _around(accepted, frame.image.shape)
+
+
+def _around(accepted: list[MarkerCandidate], shape: tuple[int, ...]) -> _Box | None:
+    """A box with even corners round all candidates, wide enough for the green marks beside them."""
+    if not accepted:
+        return None
+    low, high = [10**6, 10**6], [0, 0]
+    for c in accepted:
+        size = (c.corners.max(0) - c.corners.min(0)).max()
+        reach = 2 * size + 40
+        for k in (0, 1):
+            low[k] = min(low[k], int(c.center[k] - reach))
+            high[k] = max(high[k], int(c.center[k] + reach))
+    x, y = max(low[0], 0) // 2 * 2, max(low[1], 0) // 2 * 2
+    width, height = (min(high[0], shape[1]) - x) // 2 * 2, (min(high[1], shape[0]) - y) // 2 * 2
+    return (x, y, width, height) if min(width, height) >= 16 else None

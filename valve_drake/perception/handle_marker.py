@@ -1,0 +1,96 @@
+"""The green mark of a handle in a wrist image, and the feature that the image servo controls.
+
+No calibration is used. feature = (u, v, 1) / sqrt(area), with (u, v) the image of the mark's centre and the area
+that of the fitted quadrilateral: a mask's area would shift the depth by its ring of half-lit pixels.
+"""
+
+import dataclasses as dc
+
+import numpy as np
+
+from valve_drake.checks import require_in
+from valve_drake.messages import HandleMark
+from valve_drake.perception.color_segmentation import (
+    ColorSegmentationConfig,
+    Region,
+    check_every,
+    green_regions,
+    polygon_area,
+    quadrilateral,
+)
+from valve_drake.perception.line_fitting import LineFittingConfig, fit_quad, meet, side_lines
+
+
+@dc.dataclass
+class HandleMarkerConfig:
+    # Marks fill much of a wrist image: the neighbourhoods are larger than the head cameras'.
+    segmentation: ColorSegmentationConfig = dc.field(
+        default_factory=lambda: ColorSegmentationConfig(small_box=181, large_box=561, min_area=150, max_candidates=6)
+    )
+    lines: LineFittingConfig = dc.field(default_factory=lambda: LineFittingConfig(color_only=True))
+    border: int = 3  # a mark this near to the image's border is cut off [px]
+    min_fill: float = 0.85  # region's area over its quadrilateral's, and the inverse
+    max_aspect: float = 4.0  # long side over short side in the image
+    center_weight: float = 1.0  # how much nearness to the image's centre counts against size
+    every: dict[str, int] = dc.field(
+        default_factory=lambda: {"reach": 1, "servo": 1, "grasp": 8}
+    )  # mode -> look every n-th step; 0 or missing = never
+
+    def check(self) -> None:
+        self.segmentation.check()
+        self.lines.check()
+        for name, low, high in (("border", 0, 100), ("min_fill", 0.3, 1), ("max_aspect", 1, 20), ("center_weight", 0, 100)):
+            require_in(getattr(self, name), low, high, f"handle_marker.{name}")
+        check_every(self.every, "handle_marker.every")
+
+
+def find_mark(image: np.ndarray, config: HandleMarkerConfig) -> HandleMark:
+    """The nearest and most central green quadrilateral of an image (H, W, 3) uint8 RGB.
+
+    At the border: found is False, reason "border", centre and area are those of the visible part.
+    """
+    regions = [r for r in green_regions(image, config.segmentation) if r.area >= config.segmentation.min_area]
+    if not regions:
+        return HandleMark(reason="no green region")
+    reasons = []
+    for region in sorted(regions, key=lambda r: -_score(r, image.shape, config)):
+        mark = _judge(image, region, config)
+        if mark.found or mark.reason == "border":
+            return mark
+        reasons.append(mark.reason)
+    return HandleMark(reason=reasons[0])
+
+
+def _score(region: Region, shape: tuple[int, ...], config: HandleMarkerConfig) -> float:
+    half = np.array([shape[1], shape[0]]) / 2
+    off = np.linalg.norm((region.center - half) / half)
+    return float(np.sqrt(region.area) * region.evenness / (1 + config.center_weight * off**2))
+
+
+def _judge(image: np.ndarray, region: Region, config: HandleMarkerConfig) -> HandleMark:
+    low, high = region.contour.min(0), region.contour.max(0)
+    last = np.array([image.shape[1], image.shape[0]]) - 1 - config.border
+    if (low < config.border).any() or (high > last).any():
+        return HandleMark(center=region.center, area=region.area, reason="border")
+    corners = quadrilateral(region.contour)
+    if corners is None:
+        return HandleMark(reason="corners: not four")
+    sides = np.linalg.norm(corners[[1, 2, 3, 0]] - corners, axis=1)
+    fill = region.area / (polygon_area(corners) + sides.sum() / 2 + 1)
+    if min(fill, 1 / fill) < config.min_fill:
+        return HandleMark(reason=f"fill: {fill:.2f}")
+    if max(sides[0] + sides[2], sides[1] + sides[3]) > config.max_aspect * min(sides[0] + sides[2], sides[1] + sides[3]):
+        return HandleMark(reason="aspect")
+    quad = fit_quad(image, corners, config.lines)
+    if quad.reason:
+        return HandleMark(reason=quad.reason)
+    fitted = meet(side_lines(quad.points, quad.side)[0])
+    area = polygon_area(fitted)
+    if not np.isfinite(fitted).all() or not 0.7 < area / region.area < 1.4:
+        return HandleMark(reason="sides do not meet")
+    c = np.column_stack([fitted, np.ones(4)])
+    center = np.cross(np.cross(c[0], c[2]), np.cross(c[1], c[3]))  # the diagonals' meeting point
+    center = center[:2] / center[2]
+    return HandleMark(
+        found=True, center=center, area=area, corners=fitted, feature=np.append(center, 1.0) / np.sqrt(area)
+    )

@@ -1,0 +1,64 @@
+"""handle_marker on ports.
+
+| port | direction | type |
+|---|---|---|
+| left_wrist_image | in | CameraFrame |
+| right_wrist_image | in | CameraFrame |
+| mode | in | ModeState |
+| marks | out | HandleMarks |
+"""
+
+import dataclasses as dc
+from typing import Any
+
+from valve_drake.messages import CameraFrame, HandleMark, HandleMarks, ModeState
+from valve_drake.perception.handle_marker import HandleMarkerConfig, find_mark
+from valve_drake.ports import Block, Inputs
+
+
+@dc.dataclass(frozen=True)
+class _Memory:
+    idle: int = 1 << 30  # steps since the last look
+    left: HandleMark = dc.field(default_factory=HandleMark)
+    right: HandleMark = dc.field(default_factory=HandleMark)
+
+
+class HandleMarkerSystem(Block):
+    """Looks at both wrist images as often as the mode asks (config.every); else holds."""
+
+    INPUTS = {"left_wrist_image": CameraFrame, "right_wrist_image": CameraFrame, "mode": ModeState}
+    OUTPUTS = {"marks": HandleMarks}
+
+    def __init__(
+        self,
+        config: HandleMarkerConfig,
+        name: str = "handle_marker",
+        period: float = 1 / 16,
+        delay: float = 1 / 128,
+    ):
+        config.check()
+        self._config = config
+        super().__init__(name, period=period, slot=1, delay=delay)
+
+    def initial(self) -> _Memory:
+        return _Memory()
+
+    def step(self, time: float, inputs: Inputs, memory: _Memory) -> tuple[_Memory, dict[str, Any]]:
+        state = inputs.mode
+        every = self._config.every.get(state.mode, 0) if state is not None else 0
+        memory = dc.replace(memory, idle=memory.idle + 1)
+        if every == 0 or memory.idle < every:
+            return memory, {}
+        left = self._look(inputs.left_wrist_image, memory.left)
+        right = self._look(inputs.right_wrist_image, memory.right)
+        if left is memory.left and right is memory.right:
+            return memory, {}
+        marks = HandleMarks(time=max(left.time, right.time), left=left, right=right)
+        return _Memory(idle=0, left=left, right=right), {"marks": marks}
+
+    def _look(self, frame: CameraFrame | None, last: HandleMark) -> HandleMark:
+        """The mark in a new frame; `last` if the frame is not new."""
+        if frame is None or frame.sequence < 0 or frame.sequence == last.sequence:
+            return last
+        mark = find_mark(frame.image, self._config)
+        return dc.replace(mark, frame=frame, time=frame.time, sequence=frame.sequence)

@@ -1,0 +1,78 @@
+"""rectangle_estimator on ports.
+
+| port | direction | type |
+|---|---|---|
+| edges | in | MarkerEdges |
+| robot_state | in | RobotState |
+| mode | in | ModeState |
+| estimate | out | RectangleEstimate |
+"""
+
+import dataclasses as dc
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from valve_drake import frames
+from valve_drake.camera.lens import StereoHead
+from valve_drake.messages import MarkerEdges, Mode, ModeState, RectangleEstimate, RobotState
+from valve_drake.perception.marker import Marker
+from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
+from valve_drake.ports import Block, Inputs
+
+
+@dc.dataclass(frozen=True)
+class _Memory:
+    sequence: int = -1
+    search: int = -1  # activation of the last search: it forgets the track
+    X_OV: np.ndarray | None = None  # (3, 4) last estimate
+    time: float = -1.0  # of that estimate's image [s]
+    axis_known: bool = False
+
+
+class RectangleEstimatorSystem(Block):
+    """Estimates the marker's pose from every new pair of edges; follows its X axis from frame to frame.
+
+    head_pose: base (x, y, heading) in O and torso angles -> X_OL (3, 4).
+    """
+
+    INPUTS = {"edges": MarkerEdges, "robot_state": RobotState, "mode": ModeState}
+    OUTPUTS = {"estimate": RectangleEstimate}
+
+    def __init__(
+        self,
+        config: RectangleEstimatorConfig,
+        head: StereoHead,
+        head_pose: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        marker: Marker | None = None,
+        name: str = "rectangle_estimator",
+        period: float = 1 / 8,
+        delay: float = 3 / 128,
+    ):
+        self._config, self._head, self._head_pose = config, head, head_pose
+        self._marker = marker or Marker()
+        self._config.check()
+        self._marker.check()
+        super().__init__(name, period=period, slot=1, delay=delay)
+
+    def initial(self) -> _Memory:
+        return _Memory()
+
+    def step(self, time: float, inputs: Inputs, memory: _Memory) -> tuple[_Memory, dict[str, Any]]:
+        state = inputs.mode
+        if state is not None and state.mode == Mode.SEARCH and state.activation != memory.search:
+            memory = _Memory(sequence=memory.sequence, search=state.activation)
+        edges = inputs.edges
+        if edges is None or edges.sequence == memory.sequence:
+            return memory, {}
+        X_OL = self._head_pose(*inputs.robot_state.head_at(edges.time))
+        track = None
+        if memory.X_OV is not None and edges.time - memory.time <= self._config.track_timeout:
+            track = Track(frames.compose(frames.inverse(X_OL), memory.X_OV), memory.axis_known)
+        result = dc.replace(estimate(edges, self._head, self._marker, self._config, track), X_OL=X_OL)
+        memory = dc.replace(memory, sequence=edges.sequence)
+        if result.found:
+            X_OV = frames.compose(X_OL, result.X_LV)
+            memory = dc.replace(memory, X_OV=X_OV, time=edges.time, axis_known=result.axis_known)
+        return memory, {"estimate": result}

@@ -1,0 +1,208 @@
+"""Stage 1 of the paper's figure: which red area is the marker, and where its centre is.
+
+`match` chooses the pair of candidates, one of each head camera, that can be one rectangle of the known size: both
+centres on one epipolar line, the same depth by triangulation as by size. `triangulate` gives the centre's position
+with its covariance.
+"""
+
+import dataclasses as dc
+import math
+
+import cv2
+import numpy as np
+
+from valve_drake import frames
+from valve_drake.camera.lens import LensModel, StereoHead
+from valve_drake.checks import require_in
+from valve_drake.messages import MarkerCandidate, SegmentationPair, StereoPosition
+from valve_drake.perception.marker import NEXT, Marker
+
+
+@dc.dataclass
+class StereoPositioningConfig:
+    center_sigma: float = 0.5  # of the red area's centre [px]
+    epipolar_gate: float = 4.0  # distance from the epipolar line that is allowed [px]
+    size_gate: float = 0.18  # relative difference of depth by triangulation and by size that is allowed
+    corner_sigma: float = 1.0  # of a candidate's coarse corners, widens both gates on small ones [px]
+    shape_gate: float = 0.08  # misfit of the coarse corners to the rectangle, as a share of its size
+    yaw_sigma: float = 0.0  # of the relative yaw of the two cameras, for the covariance only; 0 = known [rad]
+    min_distance: float = 0.25  # [m]
+    max_distance: float = 6.5  # [m]
+
+    def check(self) -> None:
+        for name, low, high in (
+            ("center_sigma", 1e-3, 20),
+            ("epipolar_gate", 0.1, 100),
+            ("size_gate", 0.01, 1),
+            ("corner_sigma", 0, 20),
+            ("shape_gate", 0.01, 1),
+            ("yaw_sigma", 0, 0.2),
+            ("min_distance", 0.01, 100),
+            ("max_distance", self.min_distance, 100),
+        ):
+            require_in(getattr(self, name), low, high, f"stereo_positioning.{name}")
+
+
+@dc.dataclass(frozen=True)
+class Match:
+    """The chosen candidates by index, -1 where there is none; `reason` says why there is no pair."""
+
+    left: int = -1
+    right: int = -1
+    reason: str = ""
+
+
+def match(
+    left: tuple[MarkerCandidate, ...],
+    right: tuple[MarkerCandidate, ...],
+    head: StereoHead,
+    marker: Marker,
+    config: StereoPositioningConfig,
+) -> Match:
+    """The pair of accepted candidates that fits the marker best."""
+    seen = []
+    for candidates, lens in ((left, head.left), (right, head.right)):
+        accepted = [k for k, c in enumerate(candidates) if not c.rejected]
+        seen.append([(k, *_by_size(candidates[k], lens, marker)) for k in accepted])
+    for side, one in zip(("left", "right"), seen):
+        if not one:
+            return Match(reason=f"no candidate in the {side} image")
+    best, least, reason = None, math.inf, ""
+    for i, depth_i, misfit_i in seen[0]:
+        for j, depth_j, misfit_j in seen[1]:
+            cost, why = _disagreement(left[i], right[j], depth_i, depth_j, max(misfit_i, misfit_j), head, config)
+            if why:
+                reason = reason or f"candidates {i}, {j}: {why}"
+            elif cost < least:
+                best, least = (i, j), cost
+    if best is None:
+        return Match(reason=reason)
+    return Match(left=best[0], right=best[1])
+
+
+def locate(
+    pair: SegmentationPair, head: StereoHead, marker: Marker, config: StereoPositioningConfig, X_OL: np.ndarray
+) -> StereoPosition:
+    """The marker's centre in the left camera, from the centres of the red area in both images."""
+    found = match(pair.left.candidates, pair.right.candidates, head, marker, config)
+    if found.reason:
+        return StereoPosition(time=pair.time, sequence=pair.sequence, X_OL=X_OL, reason=found.reason)
+    centers = pair.left.candidates[found.left].center, pair.right.candidates[found.right].center
+    p_LV, covariance, _ = triangulate(*centers, head, config.center_sigma, config.yaw_sigma)
+    return StereoPosition(
+        time=pair.time, sequence=pair.sequence, found=True, p_LV=p_LV, covariance=covariance, X_OL=X_OL
+    )
+
+
+def single(
+    candidates: tuple[MarkerCandidate, ...], lens: LensModel, marker: Marker, config: StereoPositioningConfig
+) -> int:
+    """Index of the accepted candidate that one camera alone takes for the marker, or -1: the best of those whose
+    corners fit the rectangle at a plausible distance."""
+    for k, candidate in enumerate(candidates):
+        if not candidate.rejected:
+            depth, misfit = _by_size(candidate, lens, marker)
+            if misfit < _shape_gate(candidate, config) and config.min_distance < depth < config.max_distance:
+                return k
+    return -1
+
+
+def triangulate(
+    center_left: np.ndarray, center_right: np.ndarray, head: StereoHead, sigma: float, yaw_sigma: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Position of a point seen at raw px (2,) in both cameras: p_L (3,) [m], covariance (3, 3) [m^2], and the
+    distance between the two rays' pixels after the fit [px].
+
+    Least squares of the pixel errors (sigma [px] each, both coordinates). A relative yaw error of the cameras of
+    standard deviation yaw_sigma [rad] is added to the covariance.
+    """
+    X_RL = frames.inverse(head.X_LR)
+    xy = [head.left.normalize(center_left), head.right.normalize(center_right)]
+    focal = [head.left.focal(), head.right.focal()]
+    # Start: the mid-point of the rays' common perpendicular.
+    a = np.append(xy[0], 1.0)
+    b = head.X_LR[:, :3] @ np.append(xy[1], 1.0)
+    aa, ab, bb = a @ a, a @ b, b @ b
+    det = aa * bb - ab * ab
+    if det < 1e-12 * aa * bb:
+        return np.full(3, np.nan), np.full((3, 3), np.inf), math.inf
+    ta, tb = a @ head.X_LR[:, 3], b @ head.X_LR[:, 3]
+    s, t = (bb * ta - ab * tb) / det, (ab * ta - aa * tb) / det
+    p = (s * a + head.X_LR[:, 3] + t * b) / 2
+    for _ in range(3):
+        r, J, yaw = [], [], []
+        for X, seen, f in ((frames.make(np.eye(3), np.zeros(3)), xy[0], focal[0]), (X_RL, xy[1], focal[1])):
+            q = X[:, :3] @ p + X[:, 3]
+            if q[2] <= 1e-6:
+                return np.full(3, np.nan), np.full((3, 3), np.inf), math.inf
+            P = np.array([[1, 0, -q[0] / q[2]], [0, 1, -q[1] / q[2]]]) / q[2] * f
+            r.append((q[:2] / q[2] - seen) * f)
+            J.append(P @ X[:, :3])
+            yaw.append(P @ np.array([-q[2], 0, q[0]]) if X is X_RL else np.zeros(2))
+        r, J, yaw = np.concatenate(r), np.concatenate(J), np.concatenate(yaw)
+        N = np.linalg.inv(J.T @ J)
+        p = p - N @ (J.T @ r)
+    by_yaw = N @ (J.T @ yaw) * yaw_sigma
+    return p, N * sigma**2 + np.outer(by_yaw, by_yaw), float(np.linalg.norm(r))
+
+
+def _by_size(candidate: MarkerCandidate, lens: LensModel, marker: Marker) -> tuple[float, float]:
+    """Depth of a candidate by the marker's known size, and the misfit of its corners as a share of its size."""
+    corners = lens.normalize(candidate.corners)
+    size = math.sqrt(max(candidate.area, 1.0)) / lens.focal()
+    best = (math.inf, math.inf)
+    turns = (0, 1) if marker.aspect() > 1.03 else (0,)  # which sides are the long ones
+    for turn in turns:
+        # Corners of a mask lie half a pixel inside; the area does not.
+        O = np.roll(marker.corners(), turn, axis=0)
+        ok, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+            O, corners[:, None, :], np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
+        )
+        for rvec, tvec in zip(rvecs, tvecs) if ok else ():
+            X = O @ cv2.Rodrigues(rvec)[0].T + tvec.ravel()
+            if not (X[:, 2] > 1e-6).all():
+                continue
+            seen = X[:, :2] / X[:, 2:]
+            misfit = float(np.sqrt(((seen - corners) ** 2).sum(1).mean())) / size
+            if misfit < best[1]:
+                p, q = seen, seen[NEXT]
+                area = abs((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()) / 2
+                best = (float(tvec[2, 0]) * math.sqrt(area) / size, misfit)
+    return best
+
+
+def _shape_gate(candidate: MarkerCandidate, config: StereoPositioningConfig) -> float:
+    return config.shape_gate + config.corner_sigma / math.sqrt(max(candidate.area, 1.0))
+
+
+def _disagreement(
+    left: MarkerCandidate,
+    right: MarkerCandidate,
+    depth_left: float,
+    depth_right: float,
+    misfit: float,
+    head: StereoHead,
+    config: StereoPositioningConfig,
+) -> tuple[float, str]:
+    """How badly a pair fits one marker (small is good), or why it cannot be one."""
+    gate = min(_shape_gate(left, config), _shape_gate(right, config))
+    if misfit > gate:
+        return 0.0, f"shape: corners off by {misfit:.2f} of its size"
+    p, _, off = triangulate(left.center, right.center, head, config.center_sigma)
+    if not np.isfinite(p).all():
+        return 0.0, "rays do not meet"
+    # The residual of both cameras together; the epipolar distance is sqrt(2) of it.
+    off *= math.sqrt(2)
+    if off > config.epipolar_gate:
+        return 0.0, f"epipolar: {off:.1f} px"
+    if not config.min_distance < p[2] < config.max_distance:
+        return 0.0, f"distance: {p[2]:.2f} m"
+    # Relative depth error of one pixel, by size and by disparity.
+    small = 1 / math.sqrt(min(left.area, right.area))
+    disparity = head.right.focal() * np.linalg.norm(head.X_LR[:, 3]) / p[2]
+    allowed = config.size_gate + config.corner_sigma * (small + 1 / disparity)
+    p_R = frames.apply(frames.inverse(head.X_LR), p)
+    wrong = max(abs(math.log(depth_left / p[2])), abs(math.log(depth_right / p_R[2])))
+    if wrong > allowed:
+        return 0.0, f"size: {math.exp(wrong):.2f} times off"
+    return (off / config.epipolar_gate) ** 2 + (wrong / allowed) ** 2 + (misfit / gate) ** 2, ""

@@ -1,0 +1,159 @@
+"""How a stage stands on Drake's ports: `Block`, the base of every LeafSystem of the program.
+
+A block is a pure step: at fixed times it reads its inputs, and out come its memory and the messages that
+its output ports hold until the next step. All state is abstract state of the Context (nothing hidden in
+attributes), so a block can be cloned, replayed and tested alone.
+
+Time inside one control tick of 1/128 s is cut into four slots of 1/512 s, so that a measurement reaches the
+joints within one tick and no two blocks that feed each other run at the same instant:
+
+    slot 0  robot_state (measurements are gathered)
+    slot 1  perception and behaviours
+    slot 2  command_selector
+    slot 3  supervisor, and the station's wrench sensors for the next tick
+
+Every block uses UNRESTRICTED updates: a discrete update would see the plant already stepped.
+"""
+
+import time as _time
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.systems.framework import Context, InputPort, LeafSystem, State
+
+TICK = 1 / 128  # control period [s]
+SLOT = 1 / 512  # plant period, and the slots of a tick [s]
+
+Kind = type | int | AbstractValue  # a message class, the size of a vector, or a model value of one of Drake's types
+
+
+class Profile:
+    """Wall time by kind of work, each second counted once (inner work is taken off the outer's)."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._stack: list[list] = []
+
+    def __call__(self, kind: str) -> "Profile":
+        self._stack.append([kind, _time.perf_counter(), 0.0])
+        return self
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        kind, start, inner = self._stack.pop()
+        spent = _time.perf_counter() - start
+        self.seconds[kind] = self.seconds.get(kind, 0.0) + spent - inner
+        if self._stack:
+            self._stack[-1][2] += spent
+
+
+profile = Profile()
+
+
+class Inputs:
+    """Read access to a block's input ports by name, evaluated on demand: a camera that a step does
+    not look at is not rendered. An unconnected port reads as None."""
+
+    def __init__(self, block: "Block", context: Context):
+        self._block = block
+        self._context = context
+
+    def __getattr__(self, name: str) -> Any:
+        port, kind = self._block.input_ports[name]
+        if not port.HasValue(self._context):
+            return None
+        value = port.Eval(self._context)
+        if isinstance(kind, type) and not isinstance(value, kind):
+            # Connect() cannot check this: Drake sees every Python message as Value[object].
+            raise TypeError(f"{port.GetFullDescription()}: want {kind.__name__}, got {type(value).__name__}")
+        return value
+
+
+class Block(LeafSystem):
+    """A stage on ports. Subclasses set INPUTS and OUTPUTS and write `step`.
+
+    INPUTS, OUTPUTS: port name -> message class, or vector size.
+    """
+
+    INPUTS: ClassVar[dict[str, Kind]] = {}
+    OUTPUTS: ClassVar[dict[str, Kind]] = {}
+
+    def __init__(self, name: str, *, period: float = TICK, slot: int = 1, delay: float = 0.0):
+        """Runs every `period` seconds in slot `slot` of a tick, the first time `delay` seconds after 0."""
+        super().__init__()
+        self.set_name(name)
+        self.input_ports: dict[str, tuple[InputPort, Kind]] = {}
+        for port, kind in self.INPUTS.items():
+            if isinstance(kind, int):
+                declared = self.DeclareVectorInputPort(port, kind)
+            else:
+                model = kind if isinstance(kind, AbstractValue) else Value(kind())
+                declared = self.DeclareAbstractInputPort(port, model)
+            self.input_ports[port] = (declared, kind)
+        self._memory = self.DeclareAbstractState(Value(_Held(self.initial())))
+        self._held: dict[str, Any] = {}
+        vectors = {name: kind for name, kind in self.OUTPUTS.items() if isinstance(kind, int)}
+        for port, kind in self.OUTPUTS.items():
+            if port in vectors:
+                index = self.DeclareDiscreteState(kind)
+            else:
+                index = self.DeclareAbstractState(Value(kind()))
+            self._held[port] = index
+            self.DeclareStateOutputPort(port, index)
+        self.period = period
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, slot * SLOT + delay, self._update)
+
+    def initial(self) -> Any:
+        """The memory before the first step: immutable, or None."""
+        return None
+
+    def step(self, time: float, inputs: Inputs, memory: Any) -> tuple[Any, dict[str, Any]]:
+        """One step: new memory, and the outputs that change (those left out keep their value)."""
+        raise NotImplementedError(f"{type(self).__name__}.step")  # abstract
+
+    def memory(self, context: Context) -> Any:
+        """The memory in this Context, for tests and reports."""
+        return context.get_abstract_state(int(self._memory)).get_value().value
+
+    def _update(self, context: Context, state: State) -> None:
+        with profile("stages"):
+            now = context.get_time()
+            memory, outputs = self.step(now, Inputs(self, context), self.memory(context))
+        abstract = state.get_mutable_abstract_state()
+        abstract.get_mutable_value(int(self._memory)).set_value(_Held(memory))
+        for port, value in outputs.items():
+            kind = self.OUTPUTS[port]
+            if isinstance(kind, int):
+                state.get_mutable_discrete_state(int(self._held[port])).SetFromVector(np.asarray(value, float))
+            elif isinstance(value, kind):
+                abstract.get_mutable_value(int(self._held[port])).set_value(value)
+            else:
+                raise TypeError(f"{self.get_name()}.{port}: want {kind.__name__}, got {type(value).__name__}")
+
+
+class _Held:
+    """Carries a block's memory through Drake's state copies without copying it."""
+
+    __slots__ = ("value",)
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __deepcopy__(self, memo: dict) -> "_Held":
+        return self
+
+
+class SourceBlock(Block):
+    """A block without inputs whose single output is `value(time)`: operator commands, test signals."""
+
+    def __init__(self, name: str, kind: type, value: Callable[[float], Any], *, period: float = TICK, slot: int = 0):
+        self.OUTPUTS = {"value": kind}
+        self._value = value
+        super().__init__(name, period=period, slot=slot)
+
+    def step(self, time: float, inputs: Inputs, memory: Any) -> tuple[Any, dict[str, Any]]:
+        return None, {"value": self._value(time)}

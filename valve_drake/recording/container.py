@@ -1,0 +1,201 @@
+"""MCAP files, written with the work split in two: what the loop does, and what a thread can do beside it.
+
+The loop fills a Chunk, at about a microsecond a message. McapFile compresses and writes whole chunks, nearly all of
+it outside Python's lock. mcap.writer.Writer holds the lock for 7 microseconds a message wherever it runs, and so a thread that
+uses it slows the loop down. The records themselves are the mcap package's.
+"""
+
+import collections
+import os
+import struct
+import zlib
+from pathlib import Path
+from typing import IO
+
+import zstandard
+from mcap import records
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from valve_drake.checks import ConfigError
+
+CHUNK_SIZE = 1 << 20  # a chunk is closed when it is larger [bytes]
+LIBRARY = "valve_drake"
+
+_HEAD = struct.Struct("<BQ")  # opcode, length of the body
+_MESSAGE = struct.Struct("<BQHIQQ")  # the same, channel, sequence, log time, publish time
+_MESSAGE_HEAD = _MESSAGE.size - _HEAD.size
+
+
+class Chunk:
+    """Records that will be compressed together."""
+
+    def __init__(self) -> None:
+        self.definitions: list[records.Schema | records.Channel] = []
+        self.index: dict[int, list[int]] = {}  # channel -> time, offset, time, offset, ...
+        self.parts: list[bytes] = []
+        self.size = 0
+
+    def define(self, definition: records.Schema | records.Channel) -> None:
+        """Adds a schema or channel, right before its first message."""
+        self.definitions.append(definition)
+        self._append(_bytes_of(definition))
+
+    def add(self, channel: int, when: int, sequence: int, data: bytes) -> None:
+        """Adds a message; `when` [ns]."""
+        self.index.setdefault(channel, []).extend((when, self.size))
+        self._append(_MESSAGE.pack(Opcode.MESSAGE, _MESSAGE_HEAD + len(data), channel, sequence, when, when))
+        self._append(data)
+
+    def _append(self, part: bytes) -> None:
+        self.parts.append(part)
+        self.size += len(part)
+
+
+class McapFile:
+    """Writes an MCAP file of zstd chunks, with all indexes and a CRC on every byte. The same calls give the same bytes."""
+
+    def __init__(self, file: IO[bytes]):
+        self._file = file
+        self._position = 0
+        self._crc = 0  # of the section so far
+        self._definitions: list[records.Schema | records.Channel] = []
+        self._chunks: list[records.ChunkIndex] = []
+        self._attachments: list[records.AttachmentIndex] = []
+        self._metadata: list[records.MetadataIndex] = []
+        self._counts: collections.Counter[int] = collections.Counter()  # of messages by channel
+        self._write(MAGIC)
+        self._add(records.Header(profile="", library=LIBRARY))
+
+    def add_chunk(self, chunk: Chunk) -> None:
+        """Compresses and writes a chunk that has messages."""
+        content = b"".join(chunk.parts)
+        times = [when for index in chunk.index.values() for when in index[0::2]]
+        data = zstandard.compress(content)
+        span = {"message_start_time": min(times), "message_end_time": max(times)}
+        sizes = {"compression": "zstd", "uncompressed_size": len(content)}
+        offset, length = self._add(records.Chunk(data=data, uncompressed_crc=zlib.crc32(content), **span, **sizes))
+        offsets = {}
+        for channel, index in chunk.index.items():
+            body = struct.pack(f"<HI{len(index)}Q", channel, 8 * len(index), *index)
+            offsets[channel], _ = self._write(_HEAD.pack(Opcode.MESSAGE_INDEX, len(body)) + body)
+            self._counts[channel] += len(index) // 2
+        self._definitions += chunk.definitions
+        self._chunks.append(
+            records.ChunkIndex(
+                chunk_start_offset=offset,
+                chunk_length=length,
+                message_index_offsets=offsets,
+                message_index_length=self._position - offset - length,
+                compressed_size=len(data),
+                **span,
+                **sizes,
+            )
+        )
+
+    def add_metadata(self, name: str, facts: dict[str, str]) -> None:
+        offset, length = self._add(records.Metadata(name=name, metadata=facts))
+        self._metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
+
+    def add_attachment(self, file: records.Attachment) -> None:
+        offset, length = self._add(file)
+        self._attachments.append(
+            records.AttachmentIndex(
+                offset=offset,
+                length=length,
+                log_time=file.log_time,
+                create_time=file.create_time,
+                data_size=len(file.data),
+                name=file.name,
+                media_type=file.media_type,
+            )
+        )
+
+    def sync(self) -> None:
+        """Has everything on the disk, safe against a crash of the machine."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def finish(self) -> None:
+        """Ends the data and writes the summary, from which readers seek."""
+        self._add(records.DataEnd(self._crc))
+        self._crc, start = 0, self._position
+        channels = [d for d in self._definitions if isinstance(d, records.Channel)]
+        schemas = [d for d in self._definitions if isinstance(d, records.Schema)]
+        statistics = records.Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunks),
+            message_count=self._counts.total(),
+            message_start_time=min((c.message_start_time for c in self._chunks), default=0),
+            message_end_time=max((c.message_end_time for c in self._chunks), default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(schemas),
+        )
+        groups = {
+            Opcode.SCHEMA: schemas,
+            Opcode.CHANNEL: channels,
+            Opcode.STATISTICS: [statistics],
+            Opcode.CHUNK_INDEX: self._chunks,
+            Opcode.ATTACHMENT_INDEX: self._attachments,
+            Opcode.METADATA_INDEX: self._metadata,
+        }
+        offsets = []
+        for opcode, group in groups.items():
+            group_start = self._position
+            for record in group:
+                self._add(record)
+            if group:
+                offsets.append(records.SummaryOffset(opcode, group_start, self._position - group_start))
+        offsets_start = self._position
+        for offset in offsets:
+            self._add(offset)
+        crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offsets_start), self._crc)
+        self._add(records.Footer(summary_start=start, summary_offset_start=offsets_start, summary_crc=crc))
+        self._write(MAGIC)
+
+    def _add(self, record: records.McapRecord) -> tuple[int, int]:
+        return self._write(_bytes_of(record))
+
+    def _write(self, data: bytes) -> tuple[int, int]:
+        """Writes -> where it stands, and its length."""
+        offset = self._position
+        self._file.write(data)
+        self._crc = zlib.crc32(data, self._crc)
+        self._position += len(data)
+        return offset, len(data)
+
+
+def _bytes_of(record: records.McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def active(path: Path) -> Path:
+    """Where a log stands until it is complete."""
+    return path.with_name(path.name + ".active")
+
+
+def open_active(path: Path) -> IO[bytes]:
+    """Opens FILE.active of a log for writing; ConfigError if that cannot be."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return open(active(path), "wb")
+    except OSError as error:
+        raise ConfigError(f"log {path} cannot be written: {error.strerror}") from None
+
+
+def publish(file: IO[bytes], path: Path) -> None:
+    """Makes the finished FILE.active the log FILE, in one step and lastingly."""
+    file.flush()
+    os.fsync(file.fileno())
+    file.close()
+    os.replace(active(path), path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

@@ -1,0 +1,141 @@
+"""The recorder: whatever its table names, from a port through an encoder to a topic of the log."""
+
+import dataclasses as dc
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from google.protobuf.message import Message as Proto
+from pydrake.common.value import Value
+from pydrake.systems.framework import Context, InputPort, LeafSystem
+
+from valve_drake.messages import Message
+from valve_drake.ports import TICK, Kind, profile
+
+ONCE = math.inf  # a period: at the start only
+
+
+class Sink(Protocol):
+    """Where the recorder writes: writer.LogWriter, or a live view."""
+
+    def write(self, topic: str, message: Message | Proto, time: float) -> None: ...
+
+    def flush(self) -> None: ...
+
+
+@dc.dataclass(frozen=True)
+class Signal:
+    """One row of the recorder's table: what is read, when it is written, and as what.
+
+    Every `period` the row's ports are read. It is written if one of them holds another message than at the last
+    writing, or if its ports are vectors or it has none. With `key` it is written when `key(*values)` has changed.
+    Rows may share ports and topics. A row with a port that is unconnected at the first publish is left out.
+    """
+
+    topic: str
+    inputs: Mapping[str, Kind]  # port -> message class, or size of the vector
+    encode: Callable[..., Message | Proto | None]  # (time, *values) -> what to write; None: nothing
+    period: float = TICK  # [s] a multiple of TICK, or ONCE
+    key: Callable[..., Any] | None = None
+    urgent: bool = False  # brought to the disk at once
+
+
+class RecorderSystem(LeafSystem):
+    """Writes `signals` to `sink`.
+
+    | port                | dir | type                                                       |
+    |---------------------|-----|------------------------------------------------------------|
+    | all names in `signals` | in | message or vector as the row says; may be left unconnected |
+
+    Publishes every TICK from 0, in the order of the rows. A publish at t sees the values before the updates at t: what
+    the sensors show at t is written at t, what a block makes of it during the tick is written at t + TICK.
+    The sink, and what was written last, stand outside the Context: a recorder serves one simulation.
+    """
+
+    def __init__(self, sink: Sink, signals: Iterable[Signal], name: str = "recorder"):
+        super().__init__()
+        self.set_name(name)
+        self._sink = sink
+        self._ports: dict[str, _Port] = {}
+        self._rows = [_Row(signal, [self._declare(*port) for port in signal.inputs.items()]) for signal in signals]
+        self._publishes = 0
+        self.DeclarePeriodicPublishEvent(TICK, 0.0, self._publish)
+
+    def _declare(self, name: str, kind: Kind) -> "_Port":
+        if name not in self._ports:
+            if isinstance(kind, int):
+                declared = self.DeclareVectorInputPort(name, kind)
+            else:
+                declared = self.DeclareAbstractInputPort(name, Value(kind()))
+            self._ports[name] = _Port(declared, kind)
+        elif self._ports[name].kind != kind:
+            raise ValueError(f"port {name} is {self._ports[name].kind} in one row and {kind} in another")
+        return self._ports[name]
+
+    def _publish(self, context: Context) -> None:
+        with profile("logging"):
+            if self._publishes == 0:
+                self._rows = [row for row in self._rows if all(port.connected(context) for port in row.ports)]
+            self._publishes += 1
+            time = context.get_time()
+            tick = round(time / TICK)
+            for row in self._rows:
+                if row.due(tick):
+                    values = tuple([port.read(context, self._publishes) for port in row.ports])
+                    if row.news(values):
+                        self._write(row.signal, time, values)
+
+    def _write(self, signal: Signal, time: float, values: tuple) -> None:
+        message = signal.encode(time, *values)
+        if message is not None:
+            self._sink.write(signal.topic, message, time)
+            if signal.urgent:
+                self._sink.flush()
+
+
+class _Port:
+    """An input port, evaluated once in every publish however many rows read it."""
+
+    def __init__(self, port: InputPort, kind: Kind):
+        self.kind = kind
+        self._port = port
+        self._type = np.ndarray if isinstance(kind, int) else kind
+        self._read_at = 0
+        self._value: Any = None
+
+    def connected(self, context: Context) -> bool:
+        return self._port.HasValue(context)
+
+    def read(self, context: Context, publish: int) -> Any:
+        if self._read_at != publish:
+            self._read_at, self._value = publish, self._port.Eval(context)
+            if not isinstance(self._value, self._type):
+                # Connect() cannot check this: Drake sees every Python message as Value[object].
+                found = type(self._value).__name__
+                raise TypeError(f"{self._port.GetFullDescription()}: want {self._type.__name__}, got {found}")
+        return self._value
+
+
+class _Row:
+    """A signal, its ports, and what was last written of it."""
+
+    def __init__(self, signal: Signal, ports: list[_Port]):
+        if signal.period != ONCE and (signal.period < TICK or signal.period % TICK != 0):
+            raise ValueError(f"{signal.topic}: the period must be a multiple of {TICK} s, got {signal.period}")
+        self.signal = signal
+        self.ports = ports
+        self._every = 0 if signal.period == ONCE else round(signal.period / TICK)  # [ticks]
+        self._always = signal.key is None and all(isinstance(kind, int) for kind in signal.inputs.values())
+        self._last: Any = None
+
+    def due(self, tick: int) -> bool:
+        return tick % self._every == 0 if self._every else self._last is None
+
+    def news(self, values: tuple) -> bool:
+        """Whether `values` are to be written; remembers them. Messages compare by identity."""
+        mark = values if self.signal.key is None else self.signal.key(*values)
+        if not self._always and mark == self._last:
+            return False
+        self._last = mark
+        return True

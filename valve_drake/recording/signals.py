@@ -1,0 +1,278 @@
+"""The recorder's table: every topic of a log, and the makers of its rows.
+
+    /<block>/<port>           a block's output as it is (schemas.py)
+    /<camera>/image           foxglove.CompressedImage: the bytes that the program decoded, of the images that it looked at
+    /<camera>/calibration     foxglove.CameraCalibration     /<camera>/detections   foxglove.ImageAnnotations
+    /tf  /scene               foxglove.FrameTransforms, SceneUpdate
+    /joint_states  /joint_commands   foxglove.JointStates of the station's measured and commanded vectors
+    /<side>_wrist/wrench      schemas.Wrench, as the sensor gives it
+    /events  /log             foxglove.Event, foxglove.Log
+    /health  /operator/command   the station's and the operator's messages
+    /truth/...                schemas.Vector: simulation only; left out when the ports are not connected
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+from valve_drake.messages import (
+    SIDES,
+    CameraFrame,
+    Command,
+    GraspPlan,
+    HandleMarks,
+    Health,
+    MarkerEdges,
+    Message,
+    ModeState,
+    OperatorCommand,
+    RectangleEstimate,
+    RobotState,
+    SegmentationPair,
+    SelectorReport,
+    ServoState,
+    Stance,
+    Status,
+    StereoPosition,
+    TurnState,
+)
+from valve_drake.ports import TICK
+from valve_drake.recording import foxglove
+from valve_drake.recording.recorder_system import ONCE, Signal
+from valve_drake.recording.schemas import Vector, Wrench
+
+SLOW = 1 / 32  # period of what is large, or only to be looked at [s]
+BEHAVIORS = ("valve_search", "base_approach", "kinematic_approach", "image_servo", "hybrid_rotation")
+
+OUTPUTS: tuple[tuple[str, str, type[Message]], ...] = (  # block, port, kind: recorded as they are
+    ("color_segmentation", "segmentation", SegmentationPair),
+    ("line_fitting", "edges", MarkerEdges),
+    ("stereo_positioning", "position", StereoPosition),
+    ("rectangle_estimator", "estimate", RectangleEstimate),
+    ("handle_marker", "marks", HandleMarks),
+    *((block, "command", Command) for block in BEHAVIORS),
+    *((block, "status", Status) for block in BEHAVIORS),
+    ("kinematic_approach", "stance", Stance),
+    ("kinematic_approach", "plan", GraspPlan),
+    ("image_servo", "servo", ServoState),
+    ("hybrid_rotation", "turn", TurnState),
+    ("command_selector", "report", SelectorReport),
+    ("supervisor", "mode", ModeState),
+    ("operator", "command", OperatorCommand),
+)
+
+BELIEF: dict[str, type[Message]] = {  # what the 3D view is made of
+    "robot_state.robot_state": RobotState,
+    "rectangle_estimator.estimate": RectangleEstimate,
+    "kinematic_approach.plan": GraspPlan,
+    "hybrid_rotation.turn": TurnState,
+}
+
+TRUTH: dict[str, tuple[str, ...]] = {  # port of the simulated station -> names of its values
+    "truth.valve_angle": ("angle", "rate"),
+    "truth.base_pose": ("x", "y", "heading"),
+    "truth.marker_pose": tuple(f"X_WV_{row}{column}" for row in range(3) for column in range(4)),
+    "truth.stem_wrench": ("tx", "ty", "tz", "fx", "fy", "fz"),
+}
+
+TORSO = ("waist", "neck_pitch", "neck_yaw")
+MEASURED: dict[str, tuple[str, ...]] = {  # port of the station -> <joint>.<quantity> of its values
+    "base.odometry": (
+        "base_x.position",
+        "base_y.position",
+        "base_heading.position",
+        "base_forward.velocity",
+        "base_heading.velocity",
+    ),
+    "torso.position_measured": tuple(f"{joint}.position" for joint in TORSO),
+}
+COMMANDED = {
+    "base.twist_command": ("base_forward.velocity", "base_heading.velocity"),
+    "torso.position_command": tuple(f"{joint}.position" for joint in TORSO),
+}
+for _side in SIDES:
+    _arm = [f"{_side}_arm_{k}" for k in range(1, 7)]
+    MEASURED |= {
+        f"{_side}_arm.position_measured": tuple(f"{joint}.position" for joint in _arm),
+        f"{_side}_arm.velocity_measured": tuple(f"{joint}.velocity" for joint in _arm),
+        f"{_side}_arm.torque_measured": tuple(f"{joint}.effort" for joint in _arm),
+        f"{_side}_gripper.position_measured": (f"{_side}_gripper.position",),
+        f"{_side}_gripper.force_measured": (f"{_side}_gripper.effort",),
+    }
+    COMMANDED |= {
+        f"{_side}_arm.position_command": tuple(f"{joint}.position" for joint in _arm),
+        f"{_side}_gripper.position_command": (f"{_side}_gripper.position",),
+        f"{_side}_gripper.force_limit": (f"{_side}_gripper.effort",),
+    }
+
+
+def signals(
+    frames: Callable[..., Iterable[tuple[str, str, np.ndarray]]],
+    scene: SceneUpdate | None = None,
+    calibrations: Mapping[str, tuple[tuple[int, int], np.ndarray]] | None = None,
+) -> list[Signal]:
+    """All rows of the program's log.
+
+    frames: (robot state, estimate, plan, turn) -> (parent, child, X (3, 4)) of every frame to show.
+    scene: what moves with these frames.
+    calibrations: camera -> its (width, height) and pinhole matrix (3, 3) [px].
+    """
+    rows = [output(block, port, kind) for block, port, kind in OUTPUTS]
+    rows += [output("robot_state", "robot_state", RobotState, SLOW)]
+    rows += [joints("/joint_states", MEASURED), joints("/joint_commands", COMMANDED)]
+    rows += [wrench(side) for side in SIDES]
+    rows += [Signal("/health", {"health": Health}, as_it_is)]
+    rows += [row for side in SIDES for row in (*head_camera(side), *wrist_camera(side))]
+    rows += [calibration(camera, size, K) for camera, (size, K) in (calibrations or {}).items()]
+    rows += [transforms(BELIEF, frames), marker_pose()]
+    if scene is not None:
+        rows += [Signal("/scene", {}, lambda time: scene, period=ONCE)]
+    rows += [*mode_events(), health_line(), *(status_line(block) for block in BEHAVIORS)]
+    rows += [vector(f"/{port.replace('.', '/')}", port, names, SLOW) for port, names in TRUTH.items()]
+    return rows
+
+
+# ---- makers of rows
+
+
+def as_it_is(time: float, message: Message) -> Message:
+    return message
+
+
+def output(block: str, port: str, kind: type[Message], period: float = TICK) -> Signal:
+    """A block's output, on topic /<block>/<port>."""
+    return Signal(f"/{block}/{port}", {f"{block}.{port}": kind}, as_it_is, period)
+
+
+def vector(topic: str, port: str, names: Sequence[str], period: float = TICK) -> Signal:
+    """A vector port with a name for each value."""
+    names = tuple(names)
+    return Signal(topic, {port: len(names)}, lambda time, values: Vector(time, names, values), period)
+
+
+def wrench(side: str) -> Signal:
+    """A wrist's [torque; force]."""
+    return Signal(
+        f"/{side}_wrist/wrench", {f"{side}_wrist.wrench": 6}, lambda time, F: Wrench(time, torque=F[:3], force=F[3:])
+    )
+
+
+def joints(topic: str, ports: Mapping[str, Sequence[str]]) -> Signal:
+    """Vector ports as one JointStates. ports: port -> "<joint>.<quantity>" for each of its values.
+
+    The quantities are position, velocity and effort.
+    """
+    states, by_name = JointStates(), {}
+    places = []  # for each port, for each value: joint, quantity
+    for values in ports.values():
+        places.append([])
+        for value in values:
+            joint, quantity = value.split(".")
+            if joint not in by_name:
+                by_name[joint] = states.joints.add(name=joint)
+            places[-1].append((by_name[joint], quantity))
+
+    def encode(time: float, *arrays: np.ndarray) -> JointStates:
+        states.timestamp.CopyFrom(foxglove.stamp(time))
+        for targets, values in zip(places, arrays, strict=True):
+            for (joint, quantity), value in zip(targets, values.tolist(), strict=True):
+                setattr(joint, quantity, value)
+        return states
+
+    return Signal(topic, {port: len(values) for port, values in ports.items()}, encode)
+
+
+def image(camera: str, port: str, kind: type[Message], frame: Callable[[Any], CameraFrame]) -> Signal:
+    """The images that a consumer has looked at: `frame`(its message)."""
+
+    def key(message: Message) -> tuple[float, int]:
+        return frame(message).time, frame(message).sequence
+
+    return Signal(f"/{camera}/image", {port: kind}, lambda time, message: foxglove.image(frame(message)), key=key)
+
+
+def head_camera(side: str) -> list[Signal]:
+    """Images and detections of one head camera. The fitted edges follow the candidates a little later."""
+
+    def encode(time: float, pair: SegmentationPair, edges: MarkerEdges) -> Any:
+        fitted = getattr(edges, side) if edges.sequence == pair.sequence else None
+        return foxglove.detections(getattr(pair, side), fitted)
+
+    port = "color_segmentation.segmentation"
+    return [
+        image(f"head_{side}", port, SegmentationPair, lambda pair: getattr(pair, side).frame),
+        Signal(f"/head_{side}/detections", {port: SegmentationPair, "line_fitting.edges": MarkerEdges}, encode),
+    ]
+
+
+def wrist_camera(side: str) -> list[Signal]:
+    """Images and detections of one wrist camera."""
+
+    def encode(time: float, marks: HandleMarks) -> Any:
+        return foxglove.mark_detections(getattr(marks, side))
+
+    port = "handle_marker.marks"
+    return [
+        image(f"{side}_wrist", port, HandleMarks, lambda marks: getattr(marks, side).frame),
+        Signal(f"/{side}_wrist/detections", {port: HandleMarks}, encode),
+    ]
+
+
+def calibration(camera: str, size: tuple[int, int], K: np.ndarray) -> Signal:
+    """A camera's pinhole, again every second so that a viewer finds it wherever it begins."""
+    return Signal(f"/{camera}/calibration", {}, lambda time: foxglove.calibration(camera, time, size, K), period=1.0)
+
+
+def transforms(inputs: Mapping[str, type[Message]], frames: Callable[..., Iterable], period: float = SLOW) -> Signal:
+    """Frames computed from messages, valid at the first message's time."""
+    transforms = FrameTransforms()
+
+    def encode(time: float, *messages: Any) -> FrameTransforms:
+        return foxglove.transforms(messages[0].time, frames(*messages), transforms)
+
+    return Signal("/tf", inputs, encode, period)
+
+
+def marker_pose() -> Signal:
+    """Stage 2's estimate for the 3D panel."""
+    return Signal(
+        "/rectangle_estimator/pose",
+        {"rectangle_estimator.estimate": RectangleEstimate},
+        lambda time, estimate: foxglove.estimated_pose("head_left", estimate),
+    )
+
+
+def log_line(port: str, kind: type[Message], encode: Callable[[Any], Log | None], key: Callable[[Any], Any]) -> Signal:
+    """A line on /log whenever `key`(message) changes."""
+    return Signal("/log", {port: kind}, lambda time, message: encode(message), key=key)
+
+
+def status_line(block: str) -> Signal:
+    """What a behaviour says when its state changes."""
+
+    def key(status: Status) -> tuple:
+        return status.activation, status.state, status.verdict
+
+    return log_line(f"{block}.status", Status, lambda status: foxglove.status_log(block, status), key)
+
+
+def health_line() -> Signal:
+    """The station's faults."""
+    return log_line("health", Health, foxglove.health_log, lambda health: (health.faults, health.estop))
+
+
+def mode_events(port: str = "supervisor.mode") -> list[Signal]:
+    """Every change of mode, and the verdict, brought to the disk at once."""
+
+    def key(state: ModeState) -> tuple:
+        return state.mode, state.activation, state.verdict
+
+    return [
+        log_line(port, ModeState, foxglove.mode_log, key),
+        Signal("/events", {port: ModeState}, lambda time, state: foxglove.mode_event(state), key=key, urgent=True),
+    ]

@@ -1,0 +1,182 @@
+"""The log's writer: MCAP with protobuf, safe against crashes, and never in the way of the loop.
+
+`write` serialises a message and adds it to a chunk in memory. A thread compresses whole chunks and brings them to
+the disk, so that no tick waits for it. The file's bytes depend on the messages alone: chunks are closed by size, by the
+messages' own time and by `flush`, never by the clock on the wall, and nothing of the machine or the day is written.
+
+While it is being written the log is FILE.active; it is renamed to FILE when it is complete. Whatever kills the
+program, all but the last FLUSH_PERIOD of the log's own time can be read back (reader.py).
+
+When the disk refuses (full, gone) or falls MAX_BACKLOG behind, logging stops and the loop goes on: `error`
+says why, the next write tells Python's logging so, once, and closing raises LogError.
+"""
+
+import contextlib
+import dataclasses
+import logging
+import os
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from google.protobuf.message import Message as Proto
+from mcap.records import Attachment, Channel, Schema
+
+from valve_drake.messages import Message
+from valve_drake.recording import schemas
+from valve_drake.recording.container import CHUNK_SIZE, Chunk, McapFile, active, open_active, publish
+from valve_drake.recording.foxglove import NANO, nanoseconds
+
+FLUSH_PERIOD = NANO // 2  # of the messages' time [ns]
+MAX_BACKLOG = 256 << 20  # waiting for the disk [bytes]
+
+
+class LogError(Exception):
+    """A log could not be written to its end. Its text is one clear line for the user."""
+
+
+class LogWriter:
+    """Writes one log. Use it as a context manager: leaving it, for whatever reason, completes the file."""
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        self._file = open_active(self.path)
+        self._mcap = McapFile(self._file)
+        self._chunk = Chunk()
+        self._schemas: dict[str, int] = {}  # full name -> id
+        self._channels: dict[str, _Channel] = {}
+        self._interval = 0  # of FLUSH_PERIOD, that the last message belongs to
+        self._handed, self._written = 0, 0  # bytes, to the thread and by it
+        self._error = ""
+        self._told = self._closed = False
+        self._jobs: queue.SimpleQueue = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name="log writer", daemon=True)
+        self._thread.start()
+
+    @property
+    def error(self) -> str:
+        """Why logging has stopped; "" while all is well."""
+        return self._error
+
+    def write(self, topic: str, message: Message | Proto, time: float) -> None:
+        """Appends a message of `topic` at `time` [s]. Times must not decrease; a topic keeps one type of message."""
+        if self._error:
+            self._tell()
+            return
+        when = nanoseconds(time)
+        if when // FLUSH_PERIOD != self._interval:
+            self._interval = when // FLUSH_PERIOD
+            self.flush()
+        elif self._chunk.size > CHUNK_SIZE:
+            self._close_chunk()
+        channel = self._channels.get(topic) or self._define(topic, type(message))
+        if type(message) is not channel.kind:
+            raise TypeError(f"{topic} holds {channel.kind.__name__}, got {type(message).__name__}")
+        self._chunk.add(channel.id, when, channel.count, channel.encode(message))
+        channel.count += 1
+
+    def write_metadata(self, name: str, facts: Mapping[str, str]) -> None:
+        """Adds a metadata record and flushes."""
+        self._close_chunk()
+        self._hand_over(0, self._mcap.add_metadata, name, dict(facts))
+        self.flush()
+
+    def attach(self, name: str, media_type: str, data: bytes) -> None:
+        """Adds a file and flushes."""
+        file = Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
+        self._close_chunk()
+        self._hand_over(len(data), self._mcap.add_attachment, file)
+        self.flush()
+
+    def flush(self) -> None:
+        """Has everything so far brought to the disk, without waiting for it."""
+        self._close_chunk()
+        self._hand_over(0, self._mcap.sync)
+
+    def close(self) -> None:
+        """Completes the file. Raises LogError if it could not be written; what there is of it is FILE.active then."""
+        if self._closed:
+            return
+        self._closed = True
+        self._close_chunk()
+        self._hand_over(0, self._finish)
+        self._jobs.put(None)
+        self._thread.join()
+        if self._error:
+            raise LogError(self._error)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            self.close()
+        except LogError:
+            if error is None:  # else the run's own error is the one to show
+                raise
+
+    def _define(self, topic: str, kind: type) -> "_Channel":
+        """A new topic's channel, and its schema unless another topic has brought it."""
+        proto = schemas.proto_class(kind) if issubclass(kind, Message) else kind
+        name = proto.DESCRIPTOR.full_name
+        if name not in self._schemas:
+            self._schemas[name] = len(self._schemas) + 1
+            data = schemas.schema_data(proto)
+            self._chunk.define(Schema(id=self._schemas[name], name=name, encoding="protobuf", data=data))
+        encode = schemas.encode if issubclass(kind, Message) else kind.SerializeToString
+        channel = _Channel(len(self._channels) + 1, kind, encode)
+        self._channels[topic] = channel
+        self._chunk.define(
+            Channel(
+                id=channel.id, topic=topic, message_encoding="protobuf", metadata={}, schema_id=self._schemas[name]
+            )
+        )
+        return channel
+
+    def _close_chunk(self) -> None:
+        if self._chunk.size > 0:
+            self._hand_over(self._chunk.size, self._mcap.add_chunk, self._chunk)
+            self._chunk = Chunk()
+
+    def _hand_over(self, size: int, job: Callable, *args: Any) -> None:
+        self._handed += size
+        if self._handed - self._written > MAX_BACKLOG:
+            self._stop(f"the disk is {MAX_BACKLOG >> 20} MiB behind")
+        self._jobs.put((size, job, args))
+
+    def _tell(self) -> None:
+        if not self._told:
+            self._told = True
+            logging.getLogger(__name__).error("%s", self._error)
+
+    def _stop(self, reason: str) -> None:
+        self._error = self._error or f"logging stopped: {reason}; what was written is in {active(self.path)}"
+
+    def _work(self) -> None:
+        """The thread: does the jobs in their order, none after a failure."""
+        while (handed := self._jobs.get()) is not None:
+            size, job, args = handed
+            if not self._error:
+                try:
+                    job(*args)
+                except Exception as error:  # whatever it is, it must not end the run
+                    self._stop(error.strerror if isinstance(error, OSError) else repr(error))
+            self._written += size
+        if self._error:
+            with contextlib.suppress(OSError):  # what its buffer still holds has no place to go
+                self._file.close()
+
+    def _finish(self) -> None:
+        self._mcap.finish()
+        publish(self._file, self.path)
+
+
+@dataclasses.dataclass
+class _Channel:
+    id: int
+    kind: type
+    encode: Callable[[Any], bytes]
+    count: int = 0

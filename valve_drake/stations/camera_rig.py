@@ -1,0 +1,218 @@
+"""The simulated cameras: rendered images through a real lens, blur, noise and JPEG.
+
+`CameraRig` owns a scene of its own, made only to be rendered; a camera block keeps the joint positions at capture
+time and renders from them when somebody reads its port. So an image shows the instant it was taken, whenever it is read,
+and a camera that nobody looks at costs nothing.
+
+Pixel convention: Drake's renderer puts the centre of the first pixel at (0.5, 0.5), everybody else here at (0, 0).
+It is converted in `_Lensed.__init__` alone.
+"""
+
+import dataclasses as dc
+import functools
+from collections.abc import Callable, Mapping
+
+import cv2
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    LightParameter,
+    MakeRenderEngineVtk,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.tree import Frame
+from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, State
+from pydrake.systems.sensors import CameraInfo
+
+from valve_drake.camera.lens import Lens, distortion_maps
+from valve_drake.messages import CameraFrame
+from valve_drake.ports import profile
+from valve_drake.stations.scene import add_scene
+from valve_drake.stations.simulation_config import CameraConfig, LightConfig, ValveConfig
+
+MARGIN = 12  # rendered beyond the image on every side, so that the lens has something to bend in [px]
+
+
+@dc.dataclass(frozen=True)
+class Mount:
+    """One camera: its lens, the frame it sits on, and how far off that frame it really is (X_FC, (3, 4))."""
+
+    lens: Lens
+    frame: str
+    X_FC: np.ndarray
+
+
+class _Lensed:
+    """From an ideal rendered image to the raw image of one lens."""
+
+    def __init__(self, lens: Lens, supersample: int):
+        m, k = MARGIN, supersample
+        self.width, self.height = (lens.width + 2 * m) * k, (lens.height + 2 * m) * k
+        # Ideal pixel of the render in OpenCV's convention: u = fx x' + cx. Scaling by k keeps pixel edges, not centres.
+        fx, fy = lens.k_x * k, lens.k_y * k
+        cx, cy = (lens.u_0 + m + 0.5) * k - 0.5, (lens.v_0 + m + 0.5) * k - 0.5
+        self.info = CameraInfo(self.width, self.height, fx, fy, cx + 0.5, cy + 0.5)
+        # Maps into the render reduced to normal size.
+        reduced = np.array([[lens.k_x, 0, lens.u_0 + m], [0, lens.k_y, lens.v_0 + m], [0, 0, 1]])
+        self.map_u, self.map_v = distortion_maps(lens, reduced)
+        self.supersample = k
+        self.reduced = (self.width // k, self.height // k)
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        if self.supersample > 1:
+            image = cv2.resize(image, self.reduced, interpolation=cv2.INTER_AREA)
+        return cv2.remap(image, self.map_u, self.map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def lights(config: LightConfig) -> list[LightParameter]:
+    """A main lamp from above the robot's shoulder, a fill lamp from the other side, and light from the ceiling."""
+    a = config.azimuth
+    k = config.intensity
+    return [
+        LightParameter(type="directional", direction=[np.cos(a), np.sin(a), -0.7], frame="world", intensity=0.75 * k),
+        LightParameter(
+            type="directional", direction=[np.cos(a - 2), np.sin(a - 2), -0.4], frame="world", intensity=0.30 * k
+        ),
+        LightParameter(type="directional", direction=[0, 0, -1], frame="world", intensity=0.35 * k),
+        LightParameter(type="directional", direction=[1, 0, -0.1], frame="world", intensity=0.20 * k),
+    ]
+
+
+class CameraRig:
+    """The scene as the cameras see it."""
+
+    def __init__(
+        self,
+        mounts: Mapping[str, Mount],
+        valve: ValveConfig,
+        marker_size: tuple[float, float],
+        light: LightConfig,
+        camera: CameraConfig,
+        seed: int,
+    ):
+        builder = DiagramBuilder()
+        self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1.0)
+        scene_graph.set_name("scene_graph")
+        params = RenderEngineVtkParams(lights=lights(light), default_clear_color=np.array([0.80, 0.85, 0.90]))
+        scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(params))
+        self.scene = add_scene(self.plant, valve, marker_size)
+        self.plant.Finalize()
+        self._scene_graph = scene_graph
+        self._diagram = builder.Build()
+        self._context = self._diagram.CreateDefaultContext()
+        self._plant_context = self.plant.GetMyMutableContextFromRoot(self._context)
+        self._query = scene_graph.get_query_output_port()
+        self._camera = camera
+        self._gains = np.array([light.red_gain, 1.0, light.blue_gain])
+        self._seed = seed
+        self._mounts = dict(mounts)
+        self._names = sorted(mounts)
+        self._lensed = {name: _Lensed(mount.lens, camera.supersample) for name, mount in mounts.items()}
+
+    def pose(self, q: np.ndarray) -> None:
+        """Poses the renderer's own scene as it was at capture time; the running plant is not touched."""
+        self.plant.SetPositions(self._plant_context, q)
+
+    def _render(self, frame: Frame, X_FC: np.ndarray, info: CameraInfo) -> np.ndarray:
+        X = frame.GetFixedPoseInBodyFrame() @ RigidTransform(RotationMatrix(X_FC[:, :3]), X_FC[:, 3])
+        core = RenderCameraCore("vtk", info, ClippingRange(0.02, 25.0), RigidTransform())
+        query = self._query.Eval(self._scene_graph.GetMyContextFromRoot(self._context))
+        parent = self.plant.GetBodyFrameIdOrThrow(frame.body().index())
+        image = query.RenderColorImage(ColorRenderCamera(core, False), parent, X)
+        return np.ascontiguousarray(image.data[..., :3])
+
+    def ideal(self, name: str, q: np.ndarray) -> np.ndarray:
+        """The raw image of one camera without noise (H, W, 3) uint8."""
+        mount, lensed = self._mounts[name], self._lensed[name]
+        self.pose(q)
+        return lensed(self._render(self.plant.GetFrameByName(mount.frame), mount.X_FC, lensed.info))
+
+    def frame(self, name: str, q: np.ndarray, time: float, sequence: int) -> CameraFrame:
+        """What the camera delivers: lens, blur, white balance, noise, JPEG and back."""
+        image = self.ideal(name, q)
+        c = self._camera
+        if c.blur > 0:
+            image = cv2.GaussianBlur(image, (0, 0), c.blur)
+        rng = np.random.Generator(np.random.SFC64([self._seed, self._names.index(name), sequence]))
+        noise = rng.standard_normal(image.shape, dtype=np.float32)
+        values = image * self._gains.astype(np.float32) + np.float32(c.noise) * noise
+        return encode_frame(name, time, sequence, np.clip(np.rint(values), 0, 255).astype(np.uint8), c.jpeg_quality)
+
+    def view(self, X_WC: np.ndarray, q: np.ndarray, width: int, height: int, fov_y: float) -> np.ndarray:
+        """A picture from anywhere, for people (height, width, 3)."""
+        self.pose(q)
+        focal = height / 2 / np.tan(fov_y / 2)
+        info = CameraInfo(width, height, focal, focal, width / 2, height / 2)
+        return self._render(self.plant.world_frame(), X_WC, info)
+
+
+def encode_frame(camera: str, time: float, sequence: int, image: np.ndarray, quality: int) -> CameraFrame:
+    """JPEG (without chroma subsampling, which would smear red edges) and back, as a camera on a wire does."""
+    flags = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        quality,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    ]
+    data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), flags)[1].tobytes()
+    return CameraFrame(camera=camera, time=time, sequence=sequence, image=decode_image(data), data=data)
+
+
+def decode_image(data: bytes) -> np.ndarray:
+    """JPEG bytes -> (H, W, 3) RGB."""
+    return cv2.cvtColor(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+@dc.dataclass(frozen=True)
+class Capture:
+    """The state of a camera: the joint positions at the last capture."""
+
+    time: float = -1.0
+    sequence: int = -1
+    q: np.ndarray | None = None
+
+    def __deepcopy__(self, memo: dict) -> "Capture":
+        return self
+
+
+class CameraSystem(LeafSystem):
+    """One camera of the simulated station.
+
+    port       dir  type         notes
+    ---------  ---  -----------  ---------------------------------------------
+    positions  in   vector       of the whole plant
+    image      out  CameraFrame  of the last capture; rendered when it is read
+    """
+
+    def __init__(self, name: str, positions: int, period: float, render: Callable[[np.ndarray, float, int], CameraFrame]):
+        super().__init__()
+        self.set_name(name)
+        self._render = render
+        self._positions = self.DeclareVectorInputPort("positions", positions)
+        self._capture = self.DeclareAbstractState(Value(Capture()))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+        self.DeclareAbstractOutputPort(
+            "image",
+            functools.partial(Value, CameraFrame()),
+            self._calc_image,
+            prerequisites_of_calc={self.abstract_state_ticket(self._capture)},
+        )
+
+    def _update(self, context: Context, state: State) -> None:
+        old = context.get_abstract_state(int(self._capture)).get_value()
+        q = np.array(self._positions.Eval(context))
+        new = Capture(context.get_time(), old.sequence + 1, q)
+        state.get_mutable_abstract_state().get_mutable_value(int(self._capture)).set_value(new)
+
+    def _calc_image(self, context: Context, output: Value) -> None:
+        capture = context.get_abstract_state(int(self._capture)).get_value()
+        if capture.sequence < 0:
+            output.set_value(CameraFrame(camera=self.get_name()))
+            return
+        with profile("rendering"):
+            output.set_value(self._render(capture.q, capture.time, capture.sequence))

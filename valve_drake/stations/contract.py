@@ -1,0 +1,75 @@
+"""The station contract: the ports that every station exports, and nothing else. Controllers read nothing but these.
+
+A station is a Diagram: simulated, hardware or replay. Only the simulated one may add ports whose names begin with
+`truth.`; the recorder alone reads them.
+"""
+
+import dataclasses as dc
+
+from pydrake.systems.framework import Diagram, PortDataType
+
+from valve_drake.messages import SIDES, CameraFrame, Health
+
+CAMERAS = ("head_left", "head_right", "left_wrist", "right_wrist")
+TRUTH = "truth."
+
+
+@dc.dataclass(frozen=True)
+class PortSpec:
+    """One row of the contract. kind: vector size, or message class."""
+
+    name: str
+    direction: str  # in | out
+    kind: int | type
+    unit: str
+    notes: str = ""
+
+
+def _both(name: str, direction: str, kind: int | type, unit: str, notes: str = "") -> list[PortSpec]:
+    return [PortSpec(f"{side}_{name}", direction, kind, unit, notes) for side in SIDES]
+
+
+CONTRACT: tuple[PortSpec, ...] = (
+    PortSpec("base.twist_command", "in", 2, "m/s, rad/s", "forward, yaw rate"),
+    PortSpec("torso.position_command", "in", 3, "rad", "waist twist, neck pitch, neck yaw"),
+    *_both("arm.position_command", "in", 6, "rad"),
+    *_both("gripper.position_command", "in", 1, "m", "opening between the pads"),
+    *_both("gripper.force_limit", "in", 1, "N", "of the finger actuator"),
+    PortSpec("base.odometry", "out", 5, "m, rad, m/s, rad/s", "x, y, heading, forward, yaw rate; drifts"),
+    PortSpec("torso.position_measured", "out", 3, "rad"),
+    *_both("arm.position_measured", "out", 6, "rad"),
+    *_both("arm.velocity_measured", "out", 6, "rad/s"),
+    *_both("arm.torque_measured", "out", 6, "N m"),
+    *_both("gripper.position_measured", "out", 1, "m"),
+    *_both("gripper.force_measured", "out", 1, "N"),
+    *_both("wrist.wrench", "out", 6, "N m, N", "at and in the sensor frame; load felt by the sensor, with gravity"),
+    *(PortSpec(f"{camera}.image", "out", CameraFrame, "") for camera in CAMERAS),
+    PortSpec("health", "out", Health, "s", "age of every device's last report, faults, e-stop"),
+)
+
+
+def ports_of(station: Diagram) -> dict[str, tuple[str, int | str]]:
+    """Every port of a diagram: name -> (direction, vector size or "abstract")."""
+    found = {}
+    for direction, count, get in (
+        ("in", station.num_input_ports(), station.get_input_port),
+        ("out", station.num_output_ports(), station.get_output_port),
+    ):
+        for k in range(count):
+            port = get(k)
+            vector = port.get_data_type() == PortDataType.kVectorValued
+            found[port.get_name()] = (direction, port.size() if vector else "abstract")
+    return found
+
+
+def check_contract(station: Diagram) -> None:
+    """Raises TypeError that lists every missing, extra or different port."""
+    found = {name: row for name, row in ports_of(station).items() if not name.startswith(TRUTH)}
+    wanted = {s.name: (s.direction, s.kind if isinstance(s.kind, int) else "abstract") for s in CONTRACT}
+    wrong = [f"missing {name}" for name in wanted if name not in found]
+    wrong += [f"extra {name}" for name in found if name not in wanted]
+    wrong += [
+        f"{name} is {found[name]}, not {wanted[name]}" for name in wanted if name in found and found[name] != wanted[name]
+    ]
+    if wrong:
+        raise TypeError(f"{station.get_name()} breaks the station contract: " + "; ".join(wrong))

@@ -1,0 +1,405 @@
+"""The simulated station: contact physics, joint servos, wrist sensors, cameras and odometry behind the contract's ports.
+
+Nothing is welded or moved by hand: the fingers hold the handles by friction and the valve turns by the hands' forces.
+Joints are implicit PD servos with effort limits that get positions at 1/128 s, and gravity is fed forward from a model
+of the robot alone. `truth.*` ports exist here only; the recorder alone reads them.
+"""
+
+import dataclasses as dc
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.systems.controllers import InverseDynamics
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
+
+from valve_drake.camera.lens import Lens, StereoHead
+from valve_drake.frames import compose, make, rotation
+from valve_drake.messages import SIDES, Health
+from valve_drake.ports import SLOT, TICK, Block, Inputs
+from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
+from valve_drake.stations.contract import CAMERAS, CONTRACT, TRUTH, check_contract
+from valve_drake.stations.scene import Scene, add_scene, panel_pose, parse, start_pose
+from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
+
+TORSO = ("waist", "neck_pitch", "neck_yaw")
+BASE = ("base_x", "base_y", "base_yaw")
+FINGER_STIFFNESS = 2e4  # of the finger servo, as in the model file [N/m]
+
+
+def arm_joints(side: str) -> list[str]:
+    return [f"{side}_arm_{k}" for k in range(1, 7)]
+
+
+class ServoDriver(LeafSystem):
+    """From the contract's commands to what the plant's joint servos want: [q_d; v_d] of all actuators.
+
+    Arms and torso get v_d = 0 (the contract carries positions). The base integrates its twist; the gripper's
+    force limit is kept by never asking for a position farther away than the servo answers with that force.
+    """
+
+    def __init__(self, plant: MultibodyPlant, scene: Scene, start: np.ndarray):
+        super().__init__()
+        self.set_name("servo_driver")
+        names = [plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices(scene.robot)]
+        self._n = len(names)
+        self._slots = {
+            "torso.position_command": [names.index(j) for j in TORSO],
+            **{f"{s}_arm.position_command": [names.index(j) for j in arm_joints(s)] for s in SIDES},
+        }
+        self._base = [names.index(j) for j in BASE]
+        self._finger = {side: names.index(f"{side}_finger_1") for side in SIDES}
+        self._finger_q = {
+            side: plant.GetJointByName(f"{side}_finger_1", scene.robot).position_start() for side in SIDES
+        }
+        self._ports = {
+            spec.name: self.DeclareVectorInputPort(spec.name, spec.kind) for spec in CONTRACT if spec.direction == "in"
+        }
+        self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
+        self._pose = self.DeclareDiscreteState(6)  # base set point x, y, heading; time; forward, yaw rate
+        self._start = start
+        self.DeclareInitializationDiscreteUpdateEvent(self._begin)
+        self.DeclarePeriodicDiscreteUpdateEvent(TICK, 3 * SLOT, self._integrate)
+        self.DeclareVectorOutputPort("desired_state", 2 * self._n, self._calc)
+
+    def _begin(self, context: Context, state: object) -> None:
+        state.set_value(int(self._pose), np.concatenate([self._start, np.zeros(3)]))
+
+    def _at(self, context: Context) -> np.ndarray:
+        """Base set point now -> x, y, heading."""
+        x, y, h, t0, v, w = context.get_discrete_state(int(self._pose)).value()
+        dt = context.get_time() - t0
+        middle = h + w * dt / 2
+        return np.array([x + v * dt * np.cos(middle), y + v * dt * np.sin(middle), h + w * dt])
+
+    def _integrate(self, context: Context, state: object) -> None:
+        twist = self._ports["base.twist_command"].Eval(context)
+        state.set_value(int(self._pose), np.concatenate([self._at(context), [context.get_time()], twist]))
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        q_d, v_d = np.zeros(self._n), np.zeros(self._n)
+        for name, slots in self._slots.items():
+            q_d[slots] = self._ports[name].Eval(context)
+        pose = self._at(context)
+        v, w = context.get_discrete_state(int(self._pose)).value()[4:]
+        q_d[self._base] = pose
+        v_d[self._base] = [v * np.cos(pose[2]), v * np.sin(pose[2]), w]
+        state = self._state.Eval(context)
+        for side in SIDES:
+            q = state[self._finger_q[side]]
+            wanted = self._ports[f"{side}_gripper.position_command"].Eval(context)[0] / 2
+            reach = self._ports[f"{side}_gripper.force_limit"].Eval(context)[0] / FINGER_STIFFNESS
+            q_d[self._finger[side]] = q + np.clip(wanted - q, -reach, reach)
+        output.SetFromVector(np.concatenate([q_d, v_d]))
+
+
+def _rng(seed: int, stream: int, count: int) -> np.random.Generator:
+    """Random numbers that depend on nothing but these three."""
+    return np.random.Generator(np.random.SFC64([seed, 1000 + stream, count]))
+
+
+class OdometrySystem(Block):
+    """Wheel odometry: starts at zero, integrates measured wheel speeds, drifts.
+
+    port      dir  type       unit                notes
+    --------  ---  ---------  ------------------  ------------------------------------
+    base      in   vector(6)  m, rad, m/s, rad/s  x, y, heading and their rates, true
+    odometry  out  vector(5)  m, rad, m/s, rad/s  x, y, heading, forward, yaw rate
+    """
+
+    INPUTS = {"base": 6}
+    OUTPUTS = {"odometry": 5}
+
+    def __init__(self, error: ErrorConfig, seed: int):
+        self._error = error
+        self._seed = seed
+        self._scale = 1 + error.odometry_scale * _rng(seed, 0, 0).standard_normal(2)
+        super().__init__("odometry", slot=3)
+
+    def initial(self) -> tuple[np.ndarray, int]:
+        return np.zeros(5), 0
+
+    def step(self, time: float, inputs: Inputs, memory: tuple[np.ndarray, int]) -> tuple:
+        (x, y, h, _, _), count = memory
+        _, _, heading, vx, vy, w = inputs.base
+        forward = vx * np.cos(heading) + vy * np.sin(heading)
+        noise = 1 + self._error.odometry_noise * _rng(self._seed, 1, count).standard_normal(2)
+        forward, w = np.array([forward, w]) * self._scale * noise
+        middle = h + w * TICK / 2
+        new = np.array([x + forward * TICK * np.cos(middle), y + forward * TICK * np.sin(middle), h + w * TICK, forward, w])
+        return (new, count + 1), {"odometry": new}
+
+
+class WrenchSensorSystem(Block):
+    """Both wrist force-torque sensors: load felt by the sensor, in its frame, with bias and noise.
+
+    port             dir  type                notes
+    ---------------  ---  ------------------  -------------------------------------
+    reaction_forces  in   list[SpatialForce]  of the plant, by joint
+    left, right      out  vector(6)           [torque; force] [N m, N]
+    """
+
+    INPUTS = {"reaction_forces": Value[list[SpatialForce]]()}
+    OUTPUTS = {side: 6 for side in SIDES}
+
+    def __init__(self, joints: dict[str, int], error: ErrorConfig, seed: int):
+        self._joints = joints
+        self._seed = seed
+        torque, force = np.ones(3), np.ones(3)
+        self._noise = np.concatenate([error.wrench_noise_torque * torque, error.wrench_noise_force * force])
+        bias = np.concatenate([error.wrench_bias_torque * torque, error.wrench_bias_force * force])
+        draw = _rng(seed, 2, 0).standard_normal((2, 6))
+        self._bias = {side: bias * draw[k] for k, side in enumerate(SIDES)}
+        super().__init__("wrench_sensor", slot=3)
+
+    def initial(self) -> int:
+        return 0
+
+    def step(self, time: float, inputs: Inputs, memory: int) -> tuple[int, dict]:
+        forces = inputs.reaction_forces
+        draw = _rng(self._seed, 3, memory).standard_normal((2, 6))
+        out = {}
+        for k, side in enumerate(SIDES):
+            F = forces[self._joints[side]]  # on the hand, from the arm; the sensor feels the opposite
+            felt = -np.concatenate([F.rotational(), F.translational()])
+            out[side] = felt + self._bias[side] + self._noise * draw[k]
+        return memory + 1, out
+
+
+class HealthSystem(Block):
+    """The simulated machine reports that all its devices speak."""
+
+    OUTPUTS = {"health": Health}
+    DEVICES = ("base", "torso", "left_arm", "right_arm", "left_gripper", "right_gripper", "left_wrist", "right_wrist", *CAMERAS)
+
+    def __init__(self) -> None:
+        super().__init__("health", period=1 / 32, slot=0)
+
+    def step(self, time: float, inputs: Inputs, memory: None) -> tuple[None, dict]:
+        return None, {"health": Health(time=time, devices=self.DEVICES, ages=np.zeros(len(self.DEVICES)))}
+
+
+class TruthSystem(Block):
+    """What only a simulation knows, for the recorder and the metrics.
+
+    port             dir  type                notes
+    ---------------  ---  ------------------  ------------------------------------------------------
+    state            in   vector              of the whole plant
+    reaction_forces  in   list[SpatialForce]
+    valve_angle      out  vector(2)           opened since closed [rad], and its rate [rad/s]
+    base_pose        out  vector(3)           x, y, heading in W
+    marker_pose      out  vector(12)          X_WV, rows of (3, 4)
+    stem_wrench      out  vector(6)           on the valve from its bearing, in the stem's frame
+    """
+
+    OUTPUTS = {"valve_angle": 2, "base_pose": 3, "marker_pose": 12, "stem_wrench": 6}
+
+    def __init__(self, plant: MultibodyPlant, scene: Scene, bar_angle: float):
+        self.INPUTS = {"state": plant.num_multibody_states(), "reaction_forces": Value[list[SpatialForce]]()}
+        stem = plant.GetJointByName("stem", scene.valve)
+        self._stem = int(stem.index())
+        self._q = stem.position_start()
+        self._v = plant.num_positions() + stem.velocity_start()
+        self._base = [plant.GetJointByName(j, scene.robot).position_start() for j in BASE]
+        self._bar_angle = bar_angle
+        marker = plant.GetFrameByName("marker", scene.valve)
+        X = marker.GetFixedPoseInBodyFrame()
+        self._X_LinkMarker = make(X.rotation().matrix(), X.translation())
+        self._X_WP = None
+        super().__init__("truth", slot=0)
+
+    def place(self, X_WP: np.ndarray) -> "TruthSystem":
+        self._X_WP = X_WP
+        return self
+
+    def step(self, time: float, inputs: Inputs, memory: None) -> tuple[None, dict]:
+        state = inputs.state
+        q = state[self._q]
+        X_WLink = compose(self._X_WP, make(rotation(np.array([0, 0, -q])), np.zeros(3)))
+        F = inputs.reaction_forces[self._stem]
+        return None, {
+            "valve_angle": [q - self._bar_angle, state[self._v]],
+            "base_pose": state[self._base],
+            "marker_pose": compose(X_WLink, self._X_LinkMarker).ravel(),
+            "stem_wrench": np.concatenate([F.rotational(), F.translational()]),
+        }
+
+
+def true_head(head: StereoHead, error: ErrorConfig, seed: int) -> dict[str, Mount]:
+    """The head cameras as they really are: the calibration plus the errors drawn from the seed."""
+    rng = _rng(seed, 4, 0)
+    mount = make(rotation(error.head_mount * rng.standard_normal(3)), np.zeros(3))
+    wobble = error.head_rotation * rng.standard_normal(3)
+    wobble[1] = error.head_yaw * rng.standard_normal()  # about y of the camera: relative yaw
+    # Both cameras sit on the left camera's frame: the right one where the calibration has it, give or take.
+    right = compose(mount, head.X_LR, make(rotation(wobble), np.zeros(3)))
+    return {
+        "head_left": Mount(head.left, "head_left_camera", mount),
+        "head_right": Mount(head.right, "head_left_camera", right),
+    }
+
+
+def wrist_lens(focal: float) -> Lens:
+    """The wrist cameras' wide lens. Nothing else in the program knows it."""
+    return Lens(k_u=6e-7, k_v=6e-7, k_x=focal, k_y=focal, u_0=316.0, v_0=243.0)
+
+
+def make_mounts(head: StereoHead, simulation: SimulationConfig, seed: int) -> dict[str, Mount]:
+    """All four cameras of the simulated robot."""
+    wrist = wrist_lens(simulation.camera.wrist_focal)
+    return {
+        **true_head(head, simulation.error, seed),
+        **{f"{side}_wrist": Mount(wrist, f"{side}_wrist_camera", np.eye(3, 4)) for side in SIDES},
+    }
+
+
+@dc.dataclass(frozen=True)
+class Joints:
+    """Where joints lie in the plant's state and actuation."""
+
+    plant: MultibodyPlant
+    scene: Scene
+
+    def select(self, names: list[str], what: str) -> np.ndarray:
+        """0/1 matrix that picks these joints out of state ("position", "velocity") or net actuation ("torque")."""
+        if what == "torque":
+            order = [
+                self.plant.get_joint_actuator(i).joint().name()
+                for i in self.plant.GetJointActuatorIndices(self.scene.robot)
+            ]
+            columns, width = [order.index(n) for n in names], len(order)
+        else:
+            joints = [self.plant.GetJointByName(n, self.scene.robot) for n in names]
+            width = self.plant.num_multibody_states()
+            if what == "position":
+                columns = [j.position_start() for j in joints]
+            else:
+                columns = [self.plant.num_positions() + j.velocity_start() for j in joints]
+        D = np.zeros((len(names), width))
+        D[range(len(names)), columns] = 1
+        return D
+
+
+def make_simulated_station(
+    simulation: SimulationConfig,
+    marker_size: tuple[float, float],
+    head: StereoHead,
+    home: np.ndarray,
+    opening: float,
+    seed: int,
+    meshcat: Meshcat | None = None,
+) -> Diagram:
+    """The station as a Diagram named `simulated`. simulation: resolved (no distributions left); home: both arms (12,)."""
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(
+        time_step=SLOT, discrete_contact_approximation="lagged", contact_model="point", stiction_tolerance=1e-4
+    )
+    plant, scene_graph = AddMultibodyPlant(config, builder)
+    plant.set_name("plant")
+    scene_graph.set_name("scene_graph")
+    valve = simulation.valve
+    scene = add_scene(plant, valve, marker_size)
+    plant.Finalize()
+    start = start_pose(simulation.start, valve)
+    _set_start(plant, scene, simulation, start, home, opening)
+    joints = Joints(plant, scene)
+
+    driver = builder.AddSystem(ServoDriver(plant, scene, start))
+    for name, spec in {s.name: s for s in CONTRACT if s.direction == "in"}.items():
+        builder.ExportInput(driver.GetInputPort(spec.name), name)
+    builder.Connect(plant.get_state_output_port(), driver.GetInputPort("plant_state"))
+    builder.Connect(driver.GetOutputPort("desired_state"), plant.get_desired_state_input_port(scene.robot))
+    still = builder.AddSystem(ConstantVectorSource(np.zeros(2)))
+    still.set_name("valve_at_rest")
+    builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(scene.valve))
+
+    model = MultibodyPlant(SLOT)
+    parse(model, "robot")
+    model.Finalize()
+    gravity = builder.AddSystem(InverseDynamics(model, InverseDynamics.InverseDynamicsMode.kGravityCompensation))
+    gravity.set_name("gravity_compensation")
+    driver.keep_alive = model  # InverseDynamics refers to it; a Python block lives as long as the diagram
+    builder.Connect(plant.get_state_output_port(scene.robot), gravity.get_input_port_estimated_state())
+    actuation = builder.AddSystem(MatrixGain(model.MakeActuationMatrix().T))
+    actuation.set_name("gravity_torques")
+    builder.Connect(gravity.get_output_port_generalized_force(), actuation.get_input_port())
+    builder.Connect(actuation.get_output_port(), plant.get_actuation_input_port(scene.robot))
+
+    def measure(port: str, names: list[str], what: str, factor: float = 1.0, offset: np.ndarray | None = None) -> None:
+        gain = builder.AddSystem(MatrixGain(factor * joints.select(names, what)))
+        gain.set_name(port)
+        torque = what == "torque"
+        source = plant.get_net_actuation_output_port(scene.robot) if torque else plant.get_state_output_port()
+        builder.Connect(source, gain.get_input_port())
+        builder.ExportOutput(gain.get_output_port(), port)
+
+    measure("torso.position_measured", list(TORSO), "position")
+    for side in SIDES:
+        measure(f"{side}_arm.position_measured", arm_joints(side), "position")
+        measure(f"{side}_arm.velocity_measured", arm_joints(side), "velocity")
+        measure(f"{side}_arm.torque_measured", arm_joints(side), "torque")
+        measure(f"{side}_gripper.position_measured", [f"{side}_finger_1"], "position", 2.0)
+        measure(f"{side}_gripper.force_measured", [f"{side}_finger_1"], "torque", -1.0)
+
+    base = builder.AddSystem(
+        MatrixGain(np.vstack([joints.select(list(BASE), "position"), joints.select(list(BASE), "velocity")]))
+    )
+    base.set_name("base_state")
+    builder.Connect(plant.get_state_output_port(), base.get_input_port())
+    odometry = builder.AddSystem(OdometrySystem(simulation.error, seed))
+    builder.Connect(base.get_output_port(), odometry.GetInputPort("base"))
+    builder.ExportOutput(odometry.GetOutputPort("odometry"), "base.odometry")
+
+    sensors = {side: int(plant.GetJointByName(f"{side}_wrist_sensor", scene.robot).index()) for side in SIDES}
+    wrench = builder.AddSystem(WrenchSensorSystem(sensors, simulation.error, seed))
+    builder.Connect(plant.get_reaction_forces_output_port(), wrench.GetInputPort("reaction_forces"))
+    for side in SIDES:
+        builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
+
+    rig = CameraRig(
+        make_mounts(head, simulation, seed), valve, marker_size, simulation.light, simulation.camera, seed
+    )
+    positions = builder.AddSystem(MatrixGain(np.eye(plant.num_positions(), plant.num_multibody_states())))
+    positions.set_name("positions")
+    builder.Connect(plant.get_state_output_port(), positions.get_input_port())
+    for name in CAMERAS:
+        period = simulation.camera.head_period if name.startswith("head") else simulation.camera.wrist_period
+        camera = builder.AddSystem(
+            CameraSystem(name, plant.num_positions(), period, lambda q, t, k, n=name: rig.frame(n, q, t, k))
+        )
+        builder.Connect(positions.get_output_port(), camera.GetInputPort("positions"))
+        builder.ExportOutput(camera.GetOutputPort("image"), f"{name}.image")
+
+    health = builder.AddSystem(HealthSystem())
+    builder.ExportOutput(health.GetOutputPort("health"), "health")
+
+    truth = builder.AddSystem(TruthSystem(plant, scene, valve.bar_angle).place(panel_pose(valve)))
+    builder.Connect(plant.get_state_output_port(), truth.GetInputPort("state"))
+    builder.Connect(plant.get_reaction_forces_output_port(), truth.GetInputPort("reaction_forces"))
+    for name in TruthSystem.OUTPUTS:
+        builder.ExportOutput(truth.GetOutputPort(name), TRUTH + name)
+
+    if meshcat is not None:
+        params = MeshcatVisualizerParams(publish_period=1 / 16)
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, params).set_name("meshcat")
+    station = builder.Build()
+    station.set_name("simulated")
+    check_contract(station)
+    return station
+
+
+def _set_start(
+    plant: MultibodyPlant, scene: Scene, simulation: SimulationConfig, start: np.ndarray, home: np.ndarray, opening: float
+) -> None:
+    """Default positions of all joints: where the run begins."""
+    values = dict(zip(BASE, start))
+    for k, side in enumerate(SIDES):
+        values |= dict(zip(arm_joints(side), home[6 * k : 6 * k + 6]))
+        values |= {f"{side}_finger_{finger}": opening / 2 for finger in (1, 2)}
+    for name, value in values.items():
+        plant.GetJointByName(name, scene.robot).set_default_positions([value])
+    valve = simulation.valve
+    plant.GetJointByName("stem", scene.valve).set_default_positions([valve.bar_angle + max(valve.position, 0.0)])

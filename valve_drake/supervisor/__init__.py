@@ -1,0 +1,1 @@
+"""Which mode the robot is in, and the only block that writes to it."""

@@ -1,0 +1,342 @@
+"""The only writer to the robot: one command per tick, taken from the block that owns each group in this mode, and bounded.
+
+SOURCE says who commands which group in which mode. A group without an owner holds: the base brakes to zero twist, joints
+brake and stay. So does a group whose command is missing, older than `max_age`, not finite or otherwise wrong,
+and every group while the robot's state or the mode is that old. An emergency stop holds everything but the grippers, so
+that a hand can always be opened. In failed and stopped the hands open, whatever happened before.
+
+Position, speed and acceleration are bounded by motion.follow: within the bounds a command passes unchanged.
+The first command of each joint is its measured position.
+"""
+
+import dataclasses as dc
+from collections.abc import Mapping
+
+import numpy as np
+
+from valve_drake.checks import ConfigError, require, require_positive
+from valve_drake.messages import LEFT, RIGHT, SIDES, Command, Health, Mode, ModeState, RobotState, SelectorReport
+from valve_drake.motion import follow, slew
+
+BEHAVIORS = ("valve_search", "base_approach", "kinematic_approach", "image_servo", "hybrid_rotation")
+HOLD, OPEN = "hold", "command_selector"  # nobody commands this group; the selector itself opens the hand
+
+# Groups of joints commanded by position, in this order in every vector of this file.
+JOINTS = {
+    "torso": slice(0, 3),
+    "left_arm": slice(3, 9),
+    "right_arm": slice(9, 15),
+    "left_gripper": slice(15, 16),
+    "right_gripper": slice(16, 17),
+}
+GROUPS = ("base", *JOINTS)
+GRIPPERS = ("left_gripper", "right_gripper")
+
+PORTS = {
+    "base.twist_command": 2,
+    "torso.position_command": 3,
+    "left_arm.position_command": 6,
+    "right_arm.position_command": 6,
+    "left_gripper.position_command": 1,
+    "left_gripper.force_limit": 1,
+    "right_gripper.position_command": 1,
+    "right_gripper.force_limit": 1,
+}
+
+
+def _row(base: str, hands: str, grippers: str = "") -> dict[str, str]:
+    grippers = grippers or hands
+    return dict(zip(GROUPS, (base, "valve_search", hands, hands, grippers, grippers)))
+
+
+SOURCE: dict[Mode, dict[str, str]] = {
+    Mode.IDLE: _row(HOLD, "kinematic_approach"),
+    Mode.SEARCH: _row("valve_search", "kinematic_approach"),
+    Mode.ROUGH_APPROACH: _row("base_approach", "kinematic_approach"),
+    Mode.FINE_APPROACH: _row("base_approach", "kinematic_approach"),
+    Mode.MEASURE: _row(HOLD, "kinematic_approach"),
+    Mode.REACH: _row(HOLD, "kinematic_approach"),
+    Mode.SERVO: _row(HOLD, "image_servo"),
+    Mode.GRASP: _row(HOLD, "hybrid_rotation"),
+    Mode.TURN: _row(HOLD, "hybrid_rotation"),
+    Mode.RELEASE: _row(HOLD, "hybrid_rotation"),
+    Mode.VERIFY: _row(HOLD, "kinematic_approach"),
+    Mode.RETREAT: _row("base_approach", "kinematic_approach"),
+    Mode.DONE: dict.fromkeys(GROUPS, HOLD),
+    Mode.FAILED: dict.fromkeys(GROUPS, HOLD) | dict.fromkeys(GRIPPERS, OPEN),
+    Mode.STOPPED: dict.fromkeys(GROUPS, HOLD) | dict.fromkeys(GRIPPERS, OPEN),
+}
+
+
+@dc.dataclass
+class CommandSelectorConfig:
+    """Scenario key `command_selector`. Lists are per joint, in the order of the station's ports."""
+
+    base_speed: list[float] = dc.field(default_factory=lambda: [0.8, 1.2])  # forward [m/s], yaw rate [rad/s]
+    base_acceleration: list[float] = dc.field(default_factory=lambda: [0.8, 2.0])  # [m/s^2], [rad/s^2]
+    torso_low: list[float] = dc.field(default_factory=lambda: [-0.6, -0.5, -1.6])  # waist, neck pitch, neck yaw [rad]
+    torso_high: list[float] = dc.field(default_factory=lambda: [0.6, 1.1, 1.6])  # [rad]
+    torso_speed: list[float] = dc.field(default_factory=lambda: [0.8, 1.6, 1.6])  # [rad/s]
+    torso_acceleration: list[float] = dc.field(default_factory=lambda: [6.0, 6.0, 6.0])  # [rad/s^2]
+    arm_limit: list[float] = dc.field(default_factory=lambda: [2.97, 2.09, 2.62, 3.32, 2.09, 3.14])  # +- [rad]
+    arm_speed: list[float] = dc.field(default_factory=lambda: [1.2, 1.2, 1.2, 2.0, 2.0, 2.0])  # [rad/s]
+    arm_acceleration: list[float] = dc.field(default_factory=lambda: [8.0] * 6)  # [rad/s^2]
+    gripper_high: float = 0.09  # opening; the lower limit is 0 [m]
+    gripper_speed: float = 0.1  # [m/s]
+    gripper_acceleration: float = 2.0  # [m/s^2]
+    gripper_force: float = 80.0  # [N]
+    max_age: float = 0.1  # of a command, of the robot's state and of the mode, before the robot holds [s]
+    trip_force: float = 90.0  # raw force at a wrist sensor, gravity included, that trips [N]
+    trip_ticks: int = 3  # ticks in a row above it
+
+    def check(self) -> None:
+        block = "command_selector"
+        sizes = {"base": 2, "torso": 3, "arm": 6}
+        for name, value in vars(self).items():
+            if not isinstance(value, list):
+                continue
+            size = sizes[name.split("_")[0]]
+            good = len(value) == size and all(np.isfinite(value))
+            require(good, f"{block}.{name}", f"{size} finite numbers", value)
+            if name not in ("torso_low", "torso_high"):
+                require(min(value) > 0, f"{block}.{name}", "above zero", value)
+        below = all(low < high for low, high in zip(self.torso_low, self.torso_high))
+        require(below, f"{block}.torso_low", f"below torso_high {self.torso_high}", self.torso_low)
+        require_positive(self, block, [n for n, v in vars(self).items() if not isinstance(v, list)])
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Bounds:
+    """Limits of all joints in the order of JOINTS."""
+
+    low: np.ndarray  # (17,) [rad or m]
+    high: np.ndarray  # (17,)
+    speed: np.ndarray  # (17,) [1/s]
+    acceleration: np.ndarray  # (17,) [1/s^2]
+    base_speed: np.ndarray  # (2,)
+    base_acceleration: np.ndarray  # (2,)
+
+
+def bounds(config: CommandSelectorConfig) -> Bounds:
+    c = config
+
+    def joints(torso: list[float], arm: list[float], gripper: float) -> np.ndarray:
+        return np.array([*torso, *arm, *arm, gripper, gripper])
+
+    return Bounds(
+        low=joints(c.torso_low, [-x for x in c.arm_limit], 0.0),
+        high=joints(c.torso_high, c.arm_limit, c.gripper_high),
+        speed=joints(c.torso_speed, c.arm_speed, c.gripper_speed),
+        acceleration=joints(c.torso_acceleration, c.arm_acceleration, c.gripper_acceleration),
+        base_speed=np.array(c.base_speed),
+        base_acceleration=np.array(c.base_acceleration),
+    )
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Memory:
+    """What was commanded last."""
+
+    bounds: Bounds
+    position: np.ndarray  # (17,) command [rad or m]
+    velocity: np.ndarray  # (17,) of the command [1/s]
+    target: np.ndarray  # (17,) what the sources asked for, within the position limits
+    force: np.ndarray  # (2,) force limits of the grippers [N]
+    twist: np.ndarray  # (2,) of the base
+    started: bool = False  # the measured position was taken over
+    activation: int = -1
+    over: tuple[int, int] = (0, 0)  # ticks in a row with a force above the trip
+    tripped: tuple[str, ...] = ()
+
+
+def start(config: CommandSelectorConfig, initial: Mapping[str, np.ndarray]) -> Memory:
+    """Memory before the first step, holding `initial` (port name -> vector). Raises ConfigError if one does not fit."""
+    for port, size in PORTS.items():
+        if port not in initial or np.shape(initial[port]) != (size,) or not np.all(np.isfinite(initial[port])):
+            raise ConfigError(f"command_selector: initial {port} must be {size} finite numbers")
+    position = np.concatenate([np.asarray(initial[f"{group}.position_command"], float) for group in JOINTS])
+    force = np.concatenate([np.asarray(initial[f"{group}.force_limit"], float) for group in GRIPPERS])
+    twist = np.array(initial["base.twist_command"], float)
+    return Memory(bounds(config), position, np.zeros(17), position, force, twist)
+
+
+def outputs(memory: Memory) -> dict[str, np.ndarray]:
+    """The station's command ports: name -> vector."""
+    out = {"base.twist_command": memory.twist}
+    for group, part in JOINTS.items():
+        out[f"{group}.position_command"] = memory.position[part]
+    for k, group in enumerate(GRIPPERS):
+        out[f"{group}.force_limit"] = memory.force[k : k + 1]
+    return out
+
+
+def step(
+    config: CommandSelectorConfig,
+    memory: Memory,
+    time: float,
+    dt: float,
+    mode: ModeState,
+    robot_state: RobotState,
+    health: Health,
+    commands: Mapping[str, Command],
+) -> tuple[Memory, SelectorReport]:
+    """One tick of length dt -> memory (outputs(memory) are the commands), report.
+
+    commands: block name -> its Command; a block that is missing counts as silent.
+    """
+    m = memory
+    if not m.started:
+        # An empty history marks a state that nobody has measured yet.
+        if len(robot_state.history) == 0 or not np.all(np.isfinite(measured(robot_state))):
+            return m, SelectorReport(time=time, source=(HOLD,) * len(GROUPS), refused=("robot_state: none yet",))
+        position = measured(robot_state)
+        m = dc.replace(m, position=position, target=position, started=True)
+
+    source, refused = _sources(config, time, mode, robot_state, health)
+    wanted: dict[str, np.ndarray] = {}
+    for group, block in source.items():
+        if block == HOLD:
+            continue
+        if block == OPEN:
+            k = GRIPPERS.index(group)
+            wanted[group] = np.array([config.gripper_high, m.force[k]])
+            continue
+        value, problem = _asked(config, time, group, commands.get(block))
+        if problem:
+            refused.append(f"{group}: {problem}")
+        if value is None:
+            source[group] = HOLD
+        else:
+            wanted[group] = value
+
+    twist, changed = _base(m, wanted.get("base"), dt)
+    position, velocity, target, joints_changed = _joints(m, wanted, dt)
+    force, force_changed = _force(config, m, wanted)
+    over, tripped = _trip(config, m, mode, robot_state)
+    memory = dc.replace(
+        m,
+        position=position,
+        velocity=velocity,
+        target=target,
+        force=force,
+        twist=twist,
+        activation=mode.activation,
+        over=over,
+        tripped=tripped,
+    )
+    report = SelectorReport(
+        time=time,
+        source=tuple(source[group] for group in GROUPS),
+        limited=(*changed, *joints_changed, *force_changed),
+        refused=tuple(refused),
+        tripped=tripped,
+    )
+    return memory, report
+
+
+def measured(state: RobotState) -> np.ndarray:
+    """Measured joint positions in the order of JOINTS -> (17,)."""
+    return np.concatenate(
+        [state.torso, state.left_arm, state.right_arm, [state.left_gripper, state.right_gripper]]
+    )
+
+
+def _sources(
+    config: CommandSelectorConfig, time: float, mode: ModeState, robot_state: RobotState, health: Health
+) -> tuple[dict[str, str], list[str]]:
+    """Who commands each group now, and what keeps the robot still."""
+    source = dict(SOURCE[Mode(mode.mode)])
+    late = [
+        f"{name}: {time - stamp:.2f} s old"
+        for name, stamp in (("robot_state", robot_state.time), ("mode", mode.time))
+        if not time - stamp <= config.max_age
+    ]
+    if late:
+        return dict.fromkeys(GROUPS, HOLD), late
+    if health.estop:
+        return {g: s if g in GRIPPERS else HOLD for g, s in source.items()}, ["emergency stop"]
+    return source, []
+
+
+def _asked(
+    config: CommandSelectorConfig, time: float, group: str, command: Command | None
+) -> tuple[np.ndarray | None, str]:
+    """What a block asks of a group, or None with the reason if it cannot be used ("" if it does not ask)."""
+    if command is None:
+        return None, "no command"
+    if not abs(time - command.time) <= config.max_age:
+        return None, f"command {time - command.time:.2f} s old"
+    value = getattr(command, "base_twist" if group == "base" else group)
+    if value is None:
+        return None, ""
+    if not np.all(np.isfinite(value)):
+        return None, "not finite"
+    if group in GRIPPERS and value[1] < 0:
+        return None, f"force limit {value[1]:.1f} N"
+    return value, ""
+
+
+def _base(m: Memory, wanted: np.ndarray | None, dt: float) -> tuple[np.ndarray, list[str]]:
+    goal = np.zeros(2) if wanted is None else wanted
+    allowed = np.clip(goal, -m.bounds.base_speed, m.bounds.base_speed)
+    twist = slew(m.twist, allowed, m.bounds.base_acceleration * dt)
+    changed = []
+    if np.any(allowed != goal):
+        changed.append("base.velocity")
+    if np.any(np.abs(twist - allowed) > 1e-12):
+        changed.append("base.acceleration")
+    return np.where(np.abs(twist - allowed) > 1e-12, twist, allowed), changed
+
+
+def _joints(
+    m: Memory, wanted: dict[str, np.ndarray], dt: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+    b = m.bounds
+    asked, held = m.position.copy(), np.ones(17, bool)
+    for group, part in JOINTS.items():
+        if group in wanted:
+            asked[part] = wanted[group][:1] if group in GRIPPERS else wanted[group]
+            held[part] = False
+    target = np.clip(asked, b.low, b.high)
+    position, velocity = follow(target, (target - m.target) / dt, m.position, m.velocity, b.speed, b.acceleration, dt)
+    # A held joint has no target: it brakes.
+    braked = np.sign(m.velocity) * np.maximum(np.abs(m.velocity) - b.acceleration * dt, 0.0)
+    # A joint that was measured outside its limits stays where it is until a command brings it back.
+    stay = np.clip(m.position + braked * dt, np.minimum(b.low, m.position), np.maximum(b.high, m.position))
+    position = np.where(held, stay, position)
+    velocity = np.where(held, (stay - m.position) / dt, velocity)
+    target = np.where(held, position, target)
+    changed = []
+    for group in wanted:
+        part = JOINTS.get(group)
+        if part is None:
+            continue
+        if np.any(asked[part] != target[part]):
+            changed.append(f"{group}.position")
+        short = position[part] != target[part]
+        if np.any(short):
+            at_speed = np.abs(velocity[part]) >= b.speed[part] * (1 - 1e-9)
+            changed += [f"{group}.velocity"] if np.any(short & at_speed) else []
+            changed += [f"{group}.acceleration"] if np.any(short & ~at_speed) else []
+    return position, velocity, target, changed
+
+
+def _force(
+    config: CommandSelectorConfig, m: Memory, wanted: dict[str, np.ndarray]
+) -> tuple[np.ndarray, list[str]]:
+    asked = np.array([wanted[g][1] if g in wanted else m.force[k] for k, g in enumerate(GRIPPERS)])
+    force = np.minimum(asked, config.gripper_force)
+    return force, [f"{g}.force" for k, g in enumerate(GRIPPERS) if force[k] != asked[k]]
+
+
+def _trip(
+    config: CommandSelectorConfig, m: Memory, mode: ModeState, state: RobotState
+) -> tuple[tuple[int, int], tuple[str, ...]]:
+    """Counts ticks above the trip for each hand; a trip is kept until the mode changes, so that nobody misses it."""
+    kept = m.tripped if mode.activation == m.activation else ()
+    over = []
+    for count, wrench in zip(m.over, (state.left_wrench, state.right_wrench)):
+        safe = np.linalg.norm(wrench[3:]) <= config.trip_force  # False for NaN
+        over.append(0 if safe else count + 1)
+    now = [side for side, count in zip(SIDES, over) if count >= config.trip_ticks]
+    return (over[0], over[1]), tuple(side for side in (LEFT, RIGHT) if side in kept or side in now)

@@ -1,0 +1,287 @@
+"""Which mode the robot is in, and why: one pure transition function.
+
+    idle -(open, close)-> search -> rough_approach -> fine_approach -> measure -> reach -> servo -> grasp -> turn
+         -> release -> verify -> retreat -> done
+
+One block owns each mode: its Status, carrying this activation's number, ends it. What else can end a mode:
+
+    marker lost while driving or measuring      -> search again
+    measure: the stance does not serve          -> fine_approach again
+    servo failed                                -> reach again
+    grasp missed                                -> release -> reach again
+    any other failure or a missed deadline      -> the run will fail with this verdict, and the robot gets off the valve first:
+        hands at the handles (servo, grasp, turn)  -> release -> verify -> retreat -> failed
+        hands near them (reach)                    -> verify (folds the arms) -> retreat -> failed
+        elsewhere                                  -> failed
+    fault or operator's stop                    -> hands at the handles: release, then failed or stopped;
+                                                   elsewhere at once, the robot held still
+
+Retries are counted over the run and bounded, and every mode has a deadline, so a run always ends. `verify` decides `turned` by
+camera, even if the turn itself had ended with another verdict; otherwise the first verdict stays. A release that fails
+ends the run at once: command_selector opens the hands in failed and stopped.
+"""
+
+import dataclasses as dc
+import math
+from collections.abc import Mapping
+
+from valve_drake.checks import require, require_positive
+from valve_drake.messages import Health, Mode, ModeState, OperatorCommand, SelectorReport, Status, Verdict
+
+NEXT = {
+    Mode.SEARCH: Mode.ROUGH_APPROACH,
+    Mode.ROUGH_APPROACH: Mode.FINE_APPROACH,
+    Mode.FINE_APPROACH: Mode.MEASURE,
+    Mode.MEASURE: Mode.REACH,
+    Mode.REACH: Mode.SERVO,
+    Mode.SERVO: Mode.GRASP,
+    Mode.GRASP: Mode.TURN,
+    Mode.TURN: Mode.RELEASE,
+}  # release, verify and retreat end differently when the run is failing
+
+OWNER = {
+    Mode.SEARCH: "valve_search",
+    Mode.ROUGH_APPROACH: "base_approach",
+    Mode.FINE_APPROACH: "base_approach",
+    Mode.MEASURE: "kinematic_approach",
+    Mode.REACH: "kinematic_approach",
+    Mode.SERVO: "image_servo",
+    Mode.GRASP: "hybrid_rotation",
+    Mode.TURN: "hybrid_rotation",
+    Mode.RELEASE: "hybrid_rotation",
+    Mode.VERIFY: "kinematic_approach",
+    Mode.RETREAT: "base_approach",
+}
+
+BEHAVIORS = tuple(dict.fromkeys(OWNER.values()))
+TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
+CONTACT = (Mode.SERVO, Mode.GRASP, Mode.TURN)  # the hands are at the handles
+WATCHED = (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.MEASURE)  # valve_search says when the marker is lost
+
+# What a behaviour may give as the reason of its failure; anything else is a fault of the program.
+FAILURES = tuple(v for v in Verdict if v not in (Verdict.NONE, Verdict.TURNED, Verdict.STOPPED))
+
+
+def _deadlines() -> dict[str, float]:
+    return {
+        "search": 60.0,
+        "rough_approach": 30.0,
+        "fine_approach": 45.0,
+        "measure": 6.0,
+        "reach": 20.0,
+        "servo": 20.0,
+        "grasp": 12.0,
+        "turn": 60.0,
+        "release": 8.0,
+        "verify": 12.0,
+        "retreat": 15.0,
+    }
+
+
+@dc.dataclass
+class SupervisorConfig:
+    """Scenario key `supervisor`."""
+
+    deadline: dict[str, float] = dc.field(default_factory=_deadlines)  # of each mode [s]
+    turn_allowance: float = 20.0  # added to the deadline of turn [s/rad]
+    retries: dict[str, int] = dc.field(
+        default_factory=lambda: {"marker_lost": 2, "measure": 2, "servo": 2, "grasp": 2}
+    )  # in a run, by what failed
+    max_age: dict[str, float] = dc.field(
+        default_factory=lambda: {"head_left": 1.0, "head_right": 1.0}
+    )  # a device that is silent for longer is a fault [s]
+    other_age: float = 0.25  # the same for all devices not named in max_age [s]
+    report_age: float = 0.25  # the same for the health and selector reports themselves [s]
+    angle_limit: float = 12.6  # largest turn that an operator may ask for [rad]
+
+    def check(self) -> None:
+        block = "supervisor"
+        for key, names in (("deadline", set(_deadlines())), ("retries", {"marker_lost", "measure", "servo", "grasp"})):
+            given = getattr(self, key)
+            require(set(given) == names, f"{block}.{key}", f"given for exactly {sorted(names)}", sorted(given))
+        for name, value in self.deadline.items():
+            require(math.isfinite(value) and value > 0, f"{block}.deadline.{name}", "a finite number > 0", value)
+        for name, count in self.retries.items():
+            require(isinstance(count, int) and 0 <= count <= 10, f"{block}.retries.{name}", "within [0, 10]", count)
+        for name, value in self.max_age.items():
+            require(value > 0, f"{block}.max_age.{name}", "> 0", value)
+        require_positive(self, block, ("turn_allowance", "other_age", "report_age", "angle_limit"))
+
+
+@dc.dataclass(frozen=True)
+class State:
+    """The supervisor's memory."""
+
+    mode: Mode = Mode.IDLE
+    activation: int = 0
+    since: float = 0.0  # [s]
+    turn_angle: float = 0.0  # [rad]
+    verdict: Verdict = Verdict.NONE
+    reason: str = ""
+    sequence: int = -1  # of the last operator command taken
+    after_release: Mode = Mode.VERIFY  # where release leads
+    entered: tuple[Mode, ...] = ()  # modes of this run, in order
+    retried: tuple[str, ...] = ()  # what failed and was tried again in this run
+
+    def message(self, time: float) -> ModeState:
+        return ModeState(
+            time=time,
+            mode=self.mode.value,
+            activation=self.activation,
+            since=self.since,
+            attempt=max(self.entered.count(self.mode) - 1, 0),
+            turn_angle=self.turn_angle,
+            verdict=self.verdict.value,
+            reason=self.reason,
+        )
+
+
+def step(
+    config: SupervisorConfig,
+    state: State,
+    time: float,
+    statuses: Mapping[str, Status | None],
+    health: Health | None,
+    operator: OperatorCommand | None,
+    selector: SelectorReport | None,
+) -> State:
+    """One step -> new state. statuses: block name -> Status; None: that port is open."""
+    s = state
+    request = ""
+    if operator is not None and operator.sequence != s.sequence:
+        request = operator.command
+        s = dc.replace(s, sequence=operator.sequence)
+    if s.mode in TERMINAL:
+        return _reset(s, time) if request == "reset" else s
+    if request == "stop" and not _aborting(s):
+        return _abort(s, time, Mode.STOPPED, Verdict.STOPPED, "stopped by the operator")
+    fault = find_fault(config, time, health, selector)
+    if s.mode == Mode.IDLE:
+        return _begin(config, s, time, request, operator.angle, fault) if request else s
+    if fault and not _aborting(s):
+        return _abort(s, time, Mode.FAILED, Verdict.FAULT, fault)
+
+    status = statuses.get(OWNER[s.mode])
+    if status is not None and status.activation == s.activation:
+        if status.state == "succeeded":
+            return _succeed(s, time, status)
+        if status.state == "failed":
+            return _fail(config, s, time, OWNER[s.mode], status)
+    watch = statuses.get("valve_search")
+    if s.mode in WATCHED and watch is not None and watch.activation == s.activation and watch.state == "failed":
+        return _fail(config, s, time, "valve_search", watch)
+    if time - s.since > deadline(config, s):
+        return _give_up(s, time, Verdict.TIMEOUT, f"{s.mode.value} took more than {deadline(config, s):.0f} s")
+    return s
+
+
+def deadline(config: SupervisorConfig, state: State) -> float:
+    """Seconds that the present mode may take; infinite for idle and the final modes."""
+    extra = config.turn_allowance * abs(state.turn_angle) if state.mode == Mode.TURN else 0.0
+    return config.deadline.get(state.mode.value, math.inf) + extra
+
+
+def find_fault(
+    config: SupervisorConfig, time: float, health: Health | None, selector: SelectorReport | None
+) -> str:
+    """The first reason not to go on, or "". Comparisons are written so that NaN counts as a fault."""
+    if health is None or not time - health.time <= config.report_age:
+        return "no health report"
+    if health.estop:
+        return "emergency stop"
+    if health.faults:
+        return "fault: " + ", ".join(health.faults)
+    for device, age in zip(health.devices, health.ages):
+        if not age <= config.max_age.get(device, config.other_age):
+            return f"{device} silent for {age:.2f} s"
+    if selector is not None:
+        if not time - selector.time <= config.report_age:
+            return "no report from command_selector"
+        if selector.tripped:
+            return "force above the trip: " + ", ".join(f"{side} hand" for side in selector.tripped)
+    return ""
+
+
+# ---------------------------------------------------------------- transitions
+
+
+def _enter(s: State, time: float, mode: Mode, reason: str, **changes: object) -> State:
+    """A new activation."""
+    return dc.replace(
+        s, mode=mode, activation=s.activation + 1, since=time, reason=reason, entered=(*s.entered, mode), **changes
+    )
+
+
+def _reset(s: State, time: float) -> State:
+    return State(mode=Mode.IDLE, activation=s.activation + 1, since=time, reason="reset", sequence=s.sequence)
+
+
+def _begin(config: SupervisorConfig, s: State, time: float, request: str, angle: float, fault: str) -> State:
+    if request not in ("open", "close"):
+        return s
+    if not 0 < angle <= config.angle_limit:
+        return dc.replace(s, reason=f"refused: angle must be within (0, {config.angle_limit:g}] rad, got {angle}")
+    if fault:
+        return _enter(s, time, Mode.FAILED, fault, verdict=Verdict.FAULT)
+    sign = 1.0 if request == "open" else -1.0
+    return _enter(s, time, Mode.SEARCH, f"operator: {request}", turn_angle=sign * angle)
+
+
+def _aborting(s: State) -> bool:
+    return s.mode == Mode.RELEASE and s.after_release in TERMINAL
+
+
+def _abort(s: State, time: float, end: Mode, verdict: Verdict, reason: str) -> State:
+    """Fault or stop: hands off the valve first, everything else stands still at once."""
+    if s.mode == Mode.RELEASE:  # it goes on, but nothing comes after it
+        return dc.replace(s, after_release=end, verdict=verdict, reason=reason)
+    if s.mode in CONTACT:
+        return _enter(s, time, Mode.RELEASE, reason, verdict=verdict, after_release=end)
+    return _enter(s, time, end, reason, verdict=verdict)
+
+
+def _succeed(s: State, time: float, status: Status) -> State:
+    reason = status.detail or f"{s.mode.value} succeeded"
+    if s.mode == Mode.RELEASE:
+        return _enter(s, time, s.after_release, s.reason if s.verdict else reason)
+    if s.mode == Mode.VERIFY:
+        if Mode.TURN not in s.entered:  # it only folded the arms: nothing was turned
+            return _enter(s, time, Mode.RETREAT, s.reason)
+        return _enter(s, time, Mode.RETREAT, reason, verdict=Verdict.TURNED)
+    if s.mode == Mode.RETREAT:
+        return _enter(s, time, Mode.DONE if s.verdict == Verdict.TURNED else Mode.FAILED, s.reason)
+    return _enter(s, time, NEXT[s.mode], reason, after_release=Mode.VERIFY)
+
+
+def _fail(config: SupervisorConfig, s: State, time: float, block: str, status: Status) -> State:
+    """A behaviour gave up: try again, or end the run."""
+    verdict = Verdict(status.verdict) if status.verdict in FAILURES else Verdict.FAULT
+    reason = f"{block}: {status.detail or verdict.value}"
+    if verdict == Verdict.MARKER_LOST and s.mode in WATCHED:
+        cause, again = "marker_lost", Mode.SEARCH
+    elif s.mode == Mode.MEASURE and status.detail.startswith("stance"):
+        cause, again = "measure", Mode.FINE_APPROACH
+    elif s.mode == Mode.SERVO:
+        cause, again = "servo", Mode.REACH
+    elif s.mode == Mode.GRASP and verdict == Verdict.GRASP_MISSED:
+        cause, again = "grasp", Mode.RELEASE
+    else:
+        return _give_up(s, time, verdict, reason)
+    if s.retried.count(cause) >= config.retries[cause]:
+        return _give_up(s, time, verdict, reason)
+    after = Mode.REACH if again == Mode.RELEASE else Mode.VERIFY
+    return _enter(s, time, again, reason, retried=(*s.retried, cause), after_release=after)
+
+
+def _give_up(s: State, time: float, verdict: Verdict, reason: str) -> State:
+    """This run will fail. The first verdict stays, unless it was `turned` and the retreat then went wrong."""
+    if s.verdict not in (Verdict.NONE, Verdict.TURNED):
+        verdict, reason = s.verdict, s.reason
+    if s.mode in CONTACT:
+        return _enter(s, time, Mode.RELEASE, reason, verdict=verdict, after_release=Mode.VERIFY)
+    if s.mode == Mode.REACH:
+        return _enter(s, time, Mode.VERIFY, reason, verdict=verdict)
+    if s.mode == Mode.VERIFY:
+        return _enter(s, time, Mode.RETREAT, reason, verdict=verdict)
+    end = s.after_release if _aborting(s) else Mode.FAILED
+    return _enter(s, time, end, reason, verdict=verdict)

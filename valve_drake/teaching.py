@@ -1,0 +1,95 @@
+"""`valve-drake teach`: the reference image of each hand at its handle, and the image Jacobian by small moves there.
+
+On the simulated robot: both hands are put on the handles of a valve that stands straight before the robot, gripper open, and
+moved by +-20 mm along each axis of the hand. Only images are kept: features, Jacobian, reference pictures.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from valve_drake import resources
+from valve_drake.behaviors.grasp_geometry import StanceConfig, best_arc, hand_in_valve
+from valve_drake.behaviors.taught import TaughtReference, save_taught
+from valve_drake.camera.lens import load_head
+from valve_drake.checks import ConfigError
+from valve_drake.frames import compose, inverse, make, planar
+from valve_drake.kinematics import GEOMETRY
+from valve_drake.messages import LEFT, SIDES
+from valve_drake.perception.handle_marker import find_mark
+from valve_drake.scenario import Scenario, resolve
+from valve_drake.stations.camera_rig import CameraRig
+from valve_drake.stations.scene import panel_pose, start_pose
+from valve_drake.stations.simulated import BASE, arm_joints, make_mounts
+from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
+
+PROBE = 0.02  # of the hand to both sides along each of its axes [m]
+DISTANCE = 0.78  # base to the panel [m]
+IMAGES = 8  # averaged at every place
+
+
+def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.ndarray]]:
+    """References and reference pictures (H, W, 3) of both hands. Raises ConfigError if a mark is not seen."""
+    simulation = SimulationConfig(camera=resolve(scenario).simulation.camera, error=ErrorConfig())
+    simulation.start.distance = DISTANCE
+    valve = simulation.valve
+    marker = scenario.marker
+    head = load_head(resources.find(scenario.head_calibration, resources.models()))
+    mounts = make_mounts(head, simulation, scenario.seed)
+    rig = CameraRig(mounts, valve, tuple(marker.size), simulation.light, simulation.camera, scenario.seed)
+    X_WV = compose(panel_pose(valve), make(np.eye(3), np.array([0, 0, -marker.panel_depth])))
+    base = start_pose(simulation.start, valve)
+    X_BV = compose(inverse(planar(*base)), X_WV)
+    straight = {side: np.array([0.0, 0.0, 1.0]) for side in SIDES}  # the view direction is not known yet
+    arc = best_arc(X_BV, np.pi / 2, GEOMETRY, marker, StanceConfig(), straight)
+    if arc.margin < 0:
+        raise ConfigError("teach: the hands do not reach the handles")
+    q0 = {LEFT: arc.q_left, "right": arc.q_right}
+    taught, pictures = {}, {}
+    for side in SIDES:
+        X_HG = compose(inverse(GEOMETRY.X_BH()), X_BV, hand_in_valve(side, arc.swapped, marker))
+
+        def look(offset: np.ndarray, side: str = side, X_HG: np.ndarray = X_HG) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+            moved = make(X_HG[:, :3], X_HG[:, 3] + X_HG[:, :3] @ offset)
+            q = GEOMETRY.arm_inverse(moved, side, q0[side])
+            if q is None:
+                raise ConfigError(f"teach: the {side} hand does not reach a probe at {offset} m")
+            positions = _positions(rig, base, q0 | {side: q}, scenario.kinematic_approach.opening)
+            frames = [rig.frame(f"{side}_wrist", positions, 0.0, k) for k in range(IMAGES)]
+            marks = [find_mark(frame.image, scenario.handle_marker) for frame in frames]
+            if not all(mark.found for mark in marks):
+                raise ConfigError(f"teach: no mark in the {side} wrist image: {marks[0].reason}")
+            mean = [np.mean([getattr(mark, name) for mark in marks], axis=0) for name in ("feature", "area", "corners")]
+            return mean[0], float(mean[1]), mean[2], frames[0].image
+
+        feature, area, corners, pictures[side] = look(np.zeros(3))
+        columns = [(look(d)[0] - look(-d)[0]) / (2 * PROBE) for d in PROBE * np.eye(3)]
+        taught[side] = TaughtReference(feature, np.column_stack(columns), area, corners)
+    return taught, pictures
+
+
+def _positions(rig: CameraRig, base: np.ndarray, arms: dict[str, np.ndarray], opening: float) -> np.ndarray:
+    """The rig's joint positions with the robot at `base` and its arms as given."""
+    values = dict(zip(BASE, base))
+    for side, q in arms.items():
+        values |= dict(zip(arm_joints(side), q))
+        values |= {f"{side}_finger_{k}": opening / 2 for k in (1, 2)}
+    positions = np.zeros(rig.plant.num_positions())
+    for name, value in values.items():
+        positions[rig.plant.GetJointByName(name, rig.scene.robot).position_start()] = value
+    return positions
+
+
+def write(scenario: Scenario, folder: Path) -> None:
+    """Teaches and writes hands.yaml, left.png and right.png into a folder."""
+    taught, pictures = teach(scenario)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_taught(
+        taught,
+        folder / "hands.yaml",
+        "Made by `valve-drake teach`. For each hand at its handle, gripper open: feature (u, v, 1)/sqrt(area),\n"
+        "image Jacobian d feature / d hand translation [1/m] in the hand's frame, area [px^2] and corners [px] of the mark.",
+    )
+    for side, picture in pictures.items():
+        cv2.imwrite(str(folder / f"{side}.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
