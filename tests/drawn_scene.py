@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 
 from valve_drake import frames
-from valve_drake.camera.lens import LensModel
+from valve_drake.camera.lens import LensModel, StereoHead
+from valve_drake.messages import MarkerEdges, QuadEdges
 from valve_drake.perception.marker import Marker
 
 FINE = 8  # sub-samples per pixel and direction on a shape's outline
@@ -84,3 +85,50 @@ def draw_valve(drawing: Drawing, X_CV: np.ndarray, marker: Marker, marks: bool =
 def facing(z: float, pan: float = 0.0, tilt: float = 0.0, roll: float = 0.0, x: float = 0.0, y: float = 0.0):
     """X_LV of a marker at (x, y, z) [m], turned by pan about y, tilt about x, roll about z [rad]."""
     return frames.make(frames.rot_y(pan) @ frames.rot_x(tilt) @ frames.rot_z(roll), np.array([x, y, z]))
+
+
+def edge_points(
+    X_LV: np.ndarray,
+    head: StereoHead,
+    marker: Marker,
+    sigma: float,
+    rng: np.random.Generator | None = None,
+    cameras: str = "both",
+    first: int = 0,
+) -> MarkerEdges:
+    """Points every pixel along the true sides, 3 px off the corners, with noise sigma [px] along the raw normals.
+
+    first: which corner of the rectangle is the image's corner 0 (a real image does not know).
+    """
+    quads = []
+    for name, lens, X_CL in (("left", head.left, np.eye(3, 4)), ("right", head.right, frames.inverse(head.X_LR))):
+        if cameras not in ("both", name):
+            quads.append(QuadEdges(reason="not used"))
+            continue
+        P = frames.apply(frames.compose(X_CL, X_LV), np.roll(marker.corners(), -first, axis=0))
+        xy = P[:, :2] / P[:, 2:]
+        points, side = [], []
+        for k in range(4):
+            a, b = xy[k], xy[(k + 1) % 4]
+            length = np.linalg.norm(lens.project(b) - lens.project(a))
+            n = max(int(length - 6), 2)
+            q = a + ((3 + (length - 6) * (np.arange(n) + 0.5) / n) / length)[:, None] * (b - a)
+            if rng is not None:
+                px = lens.project(q)
+                normal = np.einsum("nij,i->nj", lens.normalize_jacobian(px), [-(b - a)[1], (b - a)[0]])
+                normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+                q = lens.normalize(px + normal * rng.normal(0, sigma, (n, 1)))
+            points.append(q)
+            side += [k] * n
+        corners_px = lens.project(xy)
+        quads.append(
+            QuadEdges(
+                found=True, points=np.vstack(points), side=side, sigma=sigma, corners=xy, corners_px=corners_px
+            )
+        )
+    return MarkerEdges(time=0.0, sequence=0, left=quads[0], right=quads[1])
+
+
+def pose_error(X: np.ndarray, X_true: np.ndarray) -> np.ndarray:
+    """(theta in V, dp in L) of an estimate against the truth, as in RectangleEstimate.covariance."""
+    return np.append(frames.rotation_vector(X_true[:, :3].T @ X[:, :3]), X[:, 3] - X_true[:, 3])

@@ -70,7 +70,7 @@ def assert_holds_between_updates(rig: Rig, port: str, slot: int, period: float =
 
 
 def assert_clones_are_independent(make, change: dict[str, Any], outputs: tuple[str, ...]) -> None:
-    """make() -> Rig. A clone with other inputs goes its own way; one with the same inputs repeats the original bit by bit."""
+    """make() -> Rig. A clone with other inputs goes its own way, and the original repeats itself bit by bit."""
     rig = make().run(0.1)
     clone = rig.context.Clone()
     other = Simulator(rig.block, clone)

@@ -40,7 +40,8 @@ def same(a: Message, b: Message) -> bool:
     """Whether two messages of one class agree to the bit, pixels and encoded images aside."""
     if type(a) is not type(b):
         return False
-    return all(_same(getattr(a, name), getattr(b, name)) for name in a.__dataclass_fields__ if name not in ("image", "data"))
+    names = [name for name in a.__dataclass_fields__ if name not in ("image", "data")]
+    return all(_same(getattr(a, name), getattr(b, name)) for name in names)
 
 
 def _same(a: object, b: object) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2
 from log_samples import same, samples, write_log
-from mcap.writer import Writer
+from mcap.writer import IndexType, Writer
 
 from valve_drake.checks import ConfigError
 from valve_drake.messages import Command, Message, RobotState, Segmentation, SegmentationPair, Status
@@ -231,6 +231,20 @@ def test_a_field_that_changed_its_type_is_refused_in_one_line(tmp_path):
     write_foreign(tmp_path / "a.mcap", "valve_drake.Command", "protobuf", schema, b"\x0a\x02no")
     with pytest.raises(ConfigError, match="not recorded by this version"):
         next(LogReader(tmp_path / "a.mcap").messages())
+
+
+def test_a_log_without_summary_is_whole(tmp_path):
+    with open(tmp_path / "a.mcap", "wb") as file:
+        options = {"repeat_channels": False, "repeat_schemas": False, "use_statistics": False}
+        mcap = Writer(file, index_types=IndexType.NONE, use_summary_offsets=False, **options)
+        mcap.start()
+        proto = schemas.proto_class(Status)
+        schema = mcap.register_schema(proto.DESCRIPTOR.full_name, "protobuf", schemas.schema_data(proto))
+        mcap.add_message(mcap.register_channel("/a", "protobuf", schema), 0, schemas.encode(Status(detail="x")), 0)
+        mcap.finish()
+    log = LogReader(tmp_path / "a.mcap")
+    assert log.damage == []
+    assert [message.detail for _, _, message in log.messages()] == ["x"]
 
 
 def test_a_class_that_this_version_lacks_is_read_as_protobuf(tmp_path):

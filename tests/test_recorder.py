@@ -137,7 +137,8 @@ def test_a_message_is_written_when_it_is_another_object():
 
 def test_a_publish_sees_what_was_before_the_tick():
     sink = run(Memory(), [output("a", "status", ms.Status)], {"a.status": lambda t: ms.Status(time=t, detail="x")})
-    assert [(message.time, t) for message, t in sink.of("/a/status")[1:]] == [(k * TICK, (k + 1) * TICK) for k in range(32)]
+    times = [(message.time, t) for message, t in sink.of("/a/status")[1:]]
+    assert times == [(k * TICK, (k + 1) * TICK) for k in range(32)]
 
 
 def test_vectors_are_written_at_their_period():
@@ -296,10 +297,13 @@ def test_same_run_same_log(log, tmp_path):
 
 
 def test_publishing_is_accounted_for_and_cheap(tmp_path):
-    profile.seconds.clear()
-    with LogWriter(tmp_path / "a.mcap") as writer:
-        run(writer, table(), RUN, until=2.0)
-    assert 0 < profile.seconds["logging"] / 256 < 2e-3  # measured 0.3e-3 s a tick
+    spent = []
+    for k in range(4):
+        before = profile.seconds.get("logging", 0.0)
+        with LogWriter(tmp_path / f"{k}.mcap") as writer:
+            run(writer, table(), RUN, until=0.5)
+        spent.append((profile.seconds["logging"] - before) / 64)
+    assert 0 < min(spent) < 2e-3  # a tick; 0.3e-3 to 0.5e-3 s on an idle machine
 
 
 # ---- pictures

@@ -1,4 +1,4 @@
-"""supervisor: the way through the modes, and that from every mode every mishap ends the run safely, in time, with a verdict."""
+"""supervisor: the way through the modes; from every mode every mishap ends the run safely, in time, with a verdict."""
 
 import dataclasses as dc
 import itertools
@@ -278,6 +278,13 @@ def test_a_turn_that_fails_lets_go_looks_backs_off_and_keeps_its_verdict(verdict
     state = bench.until_end(lambda s: {OWNER[s.mode]: seen.get(s.mode, {"state": "succeeded"})})
     assert bench.modes[-4:] == [Mode.RELEASE, Mode.VERIFY, Mode.RETREAT, Mode.FAILED]
     assert (state.verdict, state.reason) == (verdict, "hybrid_rotation: 12 N m")
+
+
+def test_a_reach_that_fails_folds_the_arms_and_backs_off_though_nothing_was_turned():
+    bench = bring_to(Mode.REACH)
+    state = bench.until_end(fail_in(Mode.REACH, "reach_limit", "no path"))
+    assert bench.modes[-3:] == [Mode.VERIFY, Mode.RETREAT, Mode.FAILED]
+    assert (state.verdict, state.reason) == (Verdict.REACH_LIMIT, "kinematic_approach: no path")
 
 
 def test_a_turn_that_failed_counts_as_turned_if_the_camera_says_so():

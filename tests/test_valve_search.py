@@ -1,4 +1,4 @@
-"""valve_search: finds the marker wherever it is, is not fooled by single sightings, keeps it centred, says when it is lost."""
+"""valve_search: finds the marker wherever it is, is not fooled by ghosts, keeps it centred, says when it is lost."""
 
 import dataclasses as dc
 import itertools
@@ -145,6 +145,26 @@ def test_search_is_not_fooled_by_scattered_sightings_and_still_finds_the_marker(
 def test_search_full_of_scattered_sightings_never_succeeds():
     status, _, _, _ = search(World(None, np.random.default_rng(2), ghosts=0.5), limit=30)
     assert status.state != "succeeded"
+
+
+def test_search_looks_aside_for_a_second_then_moves_on_deaf_then_listens_again():
+    robot, mode, memory = RobotState(history=np.zeros((1, 7))), ModeState(mode="search", activation=1), Memory()
+    gaze, position, shown = [], StereoPosition(), (0.5, 1.75, 2.5)  # one sighting at each of these times
+    for k in range(int(3 / DT)):
+        if k * DT in shown:
+            position = StereoPosition(time=k * DT, found=True, p_LV=np.array([k * DT, 0, 3.0]))
+        memory, _, status = step(CONFIG, memory, k * DT, DT, robot, mode, position, RectangleEstimate(), HEAD)
+        gaze.append(memory.gaze)
+    sweeping = np.diff(gaze) != 0
+
+    def share(start, end):
+        return np.mean(sweeping[int(start / DT) : int(end / DT)])
+
+    assert status.state == "running"
+    assert share(0.2, 0.45) == 1
+    assert share(0.52, 1.48) == 0  # looks at the first
+    assert share(2.0, 2.48) == 1  # the second came too soon
+    assert share(2.52, 2.98) == 0  # looks at the third
 
 
 def test_search_ignores_images_from_before_it_began():

@@ -216,5 +216,9 @@ def _teach(options: argparse.Namespace) -> int:
 def _recover(options: argparse.Namespace) -> int:
     from valve_drake.recording.reader import recover
 
-    print(recover(options.log, options.out))
-    return OK
+    source = recover(options.log, options.out)
+    count = sum(topic.count for topic in source.topics.values())
+    print(f"{options.out}: {count} messages up to {source.end:.3f} s")
+    for line in source.damage:
+        print(f"  {line}")
+    return DAMAGED if source.damage else OK

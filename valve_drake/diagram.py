@@ -162,6 +162,7 @@ def make_diagram(
     """The whole system for a resolved scenario. truth=False leaves the recorder without the `truth.*` ports."""
     builder = DiagramBuilder()
     station = builder.AddSystem(make_station(scenario, meshcat))
+    station.set_name("station")  # whichever it is: the wiring is the same
     blocks = {block.get_name(): block for block in make_blocks(scenario)}
     for block in blocks.values():
         builder.AddSystem(block)
@@ -206,14 +207,7 @@ def command(system: System, context: object, request: OperatorCommand) -> None:
 def wiring(diagram: Diagram) -> list[str]:
     """Every connection of a diagram as "block.port -> block.port", sorted."""
     lines = [
-        f"{a.get_system().get_name()}.{a.get_system().get_output_port(i).get_name()} -> "
-        f"{b.get_system().get_name()}.{b.get_system().get_input_port(j).get_name()}"
-        for (b, j), (a, i) in _connections(diagram)
+        f"{a.get_name()}.{a.get_output_port(i).get_name()} -> {b.get_name()}.{b.get_input_port(j).get_name()}"
+        for (b, j), (a, i) in diagram.connection_map().items()
     ]
     return sorted(lines)
-
-
-def _connections(diagram: Diagram) -> list:
-    return [((target[0], int(target[1])), (source[0], int(source[1]))) for target, source in diagram.connection_map().items()]
-
-

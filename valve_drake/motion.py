@@ -35,9 +35,9 @@ def follow(
     """One step of a commanded position after a target -> position, velocity.
 
     Never overshoots: the result lies between `position` and `target`. No faster than `speed`; gains speed, and brakes
-    for a target at rest, by no more than `acceleration`. A target that itself keeps these bounds is met exactly, without
-    lag, since braking counts against its own velocity. A target that stops or turns back more abruptly than that
-    is obeyed at once: running past it could hit something.
+    for a target at rest, by no more than `acceleration`. A target that itself keeps these bounds is met exactly,
+    without lag, since braking counts against its own velocity. A target that stops or turns back more abruptly than
+    that is obeyed at once: running past it could hit something.
     """
     gap = target - position
     side = np.sign(gap)
@@ -45,5 +45,5 @@ def follow(
     lead = np.clip(side * target_velocity, 0.0, speed)
     brake = lead + braking_speed(np.maximum(distance - lead * dt, 0.0), acceleration, dt)
     reach = np.minimum(np.minimum(np.maximum(side * velocity, 0.0) + acceleration * dt, speed), brake) * dt
-    new = np.where(reach >= distance * (1 - 1e-9), target, position + side * reach)
+    new = np.where(reach >= distance, target, position + side * reach)
     return new, (new - position) / dt

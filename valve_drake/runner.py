@@ -1,12 +1,13 @@
 """One run of the system: build it, advance it until the supervisor has ended, log everything, say what happened."""
 
+import contextlib
 import dataclasses as dc
 import importlib.metadata
 import json
 import platform
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -21,10 +22,11 @@ from valve_drake.diagram import System, command, make_diagram
 from valve_drake.messages import Mode, ModeState, OperatorCommand
 from valve_drake.ports import profile
 from valve_drake.recording import layout
+from valve_drake.recording.container import active
 from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.recording.robot_frames import RobotFrames, pinholes
 from valve_drake.recording.signals import signals
-from valve_drake.recording.writer import LogWriter
+from valve_drake.recording.writer import LogError, LogWriter
 from valve_drake.scenario import Scenario, dump, resolve
 
 STEP = 1 / 32  # between two looks at the mode [s]
@@ -128,9 +130,9 @@ def run(
     meshcat = None
     if html is not None or meshcat_port is not None:
         meshcat = Meshcat(MeshcatParams(host="localhost", port=meshcat_port))
-    log_error = ""
     profile.seconds.clear()
-    with LogWriter(log) as writer:
+    writer = LogWriter(log)
+    with _log_kept(writer):
         writer.write_metadata(
             "run", {"scenario": dump(scenario), "seed": str(scenario.seed), "station": scenario.station, **versions()}
         )
@@ -143,14 +145,24 @@ def run(
         mode = _advance(system, simulator, scenario, duration, show, stop, begin)
         wall = time.perf_counter() - begin
         writer.write_metadata("result", _result_metadata(mode, simulator.get_context().get_time()))
-        log_error = writer.error
     if html is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
         html.write_text(meshcat.StaticHtml(), encoding="utf-8")
     shares = {kind: seconds / wall for kind, seconds in profile.seconds.items()}
     shares["physics"] = 1.0 - sum(shares.values())
-    return Result(summarize(log), wall, log, html, log_error, shares)
+    written = log if not writer.error else active(log)
+    return Result(summarize(written), wall, written, html, writer.error, shares)
+
+
+@contextlib.contextmanager
+def _log_kept(writer: LogWriter) -> Iterator[None]:
+    """Completes the log at the end, however that comes; a disk that failed ends the log and not the run."""
+    try:
+        with writer:
+            yield
+    except LogError:
+        pass  # writer.error says why; the caller reports it
 
 
 def _advance(

@@ -7,15 +7,16 @@
                         align   to the stance's heading
                         line    straight in, steering onto the line through the stance
                         settle  trim heading and distance, stand still, check
-                    A differential drive cannot step sideways: if it ends beside the stance, it goes through all this again,
-                    which is to back off and come in once more.
+                    A differential drive cannot step sideways: if it ends beside the stance, it goes through all this
+                    again, which is to back off and come in once more.
     retreat         straight back, once the arms are still.
 
-The panel is kept clear: the base's centre never comes nearer to the panel's plane than `clearance`. All the motions
-between two allowed points are straight, so they cannot cut through the forbidden half-plane; the speed towards it is
-bounded by braking all the same.
+The panel is kept clear: the base's centre never comes nearer to the panel's plane than `clearance`. A stance nearer
+than that is refused; from an allowed start all ways are straight lines between allowed points, and none can cut into
+the half-plane behind the clearance. A start nearer than that only moves away: the pre-stance lies further out.
 
-In the stance's frame: s along its heading, e to its left, psi the heading against it. Line law: psi_ref = -atan(e / look).
+In the stance's frame: s along its heading, e to its left, psi the heading against it.
+Line law: psi_ref = -atan(e / look).
 Frames: frames.py; everything here is on the floor, in O.
 """
 
@@ -57,8 +58,7 @@ class BaseApproachConfig:
     steering: float = 3.0  # yaw rate per heading error, at most [1/s]
     closing: float = 2.5  # speed per distance to go, at most: the base lags behind its command [1/s]
     rough_distance: float = 2.0  # the rough approach ends nearer than this [m]
-    rough_stop: float = 1.85  # and comes to rest here [m]
-    rough_nearest: float = 1.2  # it never drives on from here [m]
+    rough_stop: float = 1.85  # and comes to rest here; it never drives nearer [m]
     facing: float = 0.4  # turns on the spot beyond this bearing, before it drives [rad]
     sightings: int = 5  # the median of so many is what it steers by
     pre_stance: float = 0.6  # behind the stance [m]
@@ -82,8 +82,8 @@ class BaseApproachConfig:
         block = "base_approach"
         require_positive(self, block, vars(self))
         require(self.braking <= 1, f"{block}.braking", "at most 1", self.braking)
-        ordered = self.rough_nearest < self.rough_stop < self.rough_distance
-        require(ordered, f"{block}.rough_stop", "between rough_nearest and rough_distance", self.rough_stop)
+        within = 1.2 < self.rough_stop < self.rough_distance  # nearer, the valve's bar could be in the way of turning
+        require(within, f"{block}.rough_stop", "above 1.2 m and below rough_distance", self.rough_stop)
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -207,7 +207,7 @@ def _rough(
     if distance < config.rough_distance and _still(config, state):
         return _end(m, "succeeded", detail=m.detail) if _sure(config, m.marker) else (m, np.zeros(2))
     forward = 0.0
-    if abs(bearing) < config.facing and distance > config.rough_nearest:
+    if abs(bearing) < config.facing:
         forward = _drive(config, max(distance - config.rough_stop, 0.0), config.speed, dt) * np.cos(bearing)
     rate = _turn(config, bearing, dt) if distance > config.rough_stop else 0.0
     return m, np.array([forward, rate])
@@ -249,11 +249,13 @@ def _fine(
             return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
         return dc.replace(m, detail="waiting for a stance"), np.zeros(2)
     goal, panel = m.stance.median, m.panel.median
-    room = _room(config, panel, goal)
+    room = -_offset(goal, panel).s - config.clearance
     if room < 0:
         return _end(m, "failed", Verdict.REACH_LIMIT, f"the stance is {-room:.3f} m too near to the panel")
     base = state.odometry[:3]
     at = _offset(base, goal)
+    if m.phase != "settle":
+        m = dc.replace(m, quiet_since=time)  # stillness counts from there on
     if m.phase == "plan":
         m = _plan(config, m, base, goal, at, panel)
         if m.result == "failed":
@@ -262,11 +264,6 @@ def _fine(
         m, twist = _settle(config, m, time, dt, state, at)
     else:
         m, twist = PHASES[m.phase](config, m, dt, base, goal, at)
-    # Towards the panel never faster than braking allows.
-    into = float(np.cos(base[2] - panel[2])) * np.sign(twist[0])
-    if into > 0:
-        fastest = _drive(config, max(_room(config, panel, base), 0.0), config.speed, dt) / into
-        twist = np.array([np.clip(twist[0], -fastest, fastest), twist[1]])
     if m.result == "running":
         m = dc.replace(m, detail=f"{m.phase}: {-at.s:.3f} m to go, {at.e:+.3f} m aside, {np.degrees(at.psi):+.1f} deg")
     return m, twist
@@ -282,11 +279,6 @@ def _panel(config: BaseApproachConfig, estimate: RectangleEstimate) -> np.ndarra
     X_OV = compose(estimate.X_OL, estimate.X_LV)
     marker = np.array([*X_OV[:2, 3], np.arctan2(X_OV[1, 2], X_OV[0, 2])])
     return np.array([*_ahead(marker, config.panel_behind), marker[2]])
-
-
-def _room(config: BaseApproachConfig, panel: np.ndarray, base: np.ndarray) -> float:
-    """How far the base may still go towards the panel [m]."""
-    return -_offset(base, panel).s - config.clearance
 
 
 def _pre_stance(config: BaseApproachConfig, goal: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ import numpy as np
 
 from valve_drake.behaviors.grasp_geometry import standoff
 from valve_drake.checks import require_in, require_positive
-from valve_drake.frames import make, rotation, wrap
+from valve_drake.frames import cross, make, rotation, wrap
 from valve_drake.kinematics import RobotGeometry
 from valve_drake.messages import (
     LEFT,
@@ -43,6 +43,7 @@ from valve_drake.messages import (
 from valve_drake.perception.marker import Marker
 
 GRAVITY = 9.81
+AT_VALVE = (Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE)  # the wrists are listened to
 
 
 @dc.dataclass
@@ -86,14 +87,14 @@ def gravity_wrench(R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.n
     """What the hand's own weight puts on the wrist sensor, in its frame -> [torque; force] (6,)."""
     force = R_HG.T @ np.array([0.0, 0.0, -GRAVITY * geometry.hand_mass])
     p = np.array(geometry.p_SHand) * (1.0 if side == LEFT else np.array([-1.0, 1, 1]))
-    return np.concatenate([np.cross(p, force), force])
+    return np.concatenate([cross(p, force), force])
 
 
 def contact_wrench(raw: np.ndarray, bias: np.ndarray, R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.ndarray:
     """Load from outside on the hand, at its grip point, in H -> [torque; force] (6,)."""
     load = raw - bias - gravity_wrench(R_HG, geometry, side)
     p_SG = np.array([0.0, 0.0, geometry.grip_behind])
-    torque = load[:3] - np.cross(p_SG, load[3:])
+    torque = load[:3] - cross(p_SG, load[3:])
     return np.concatenate([R_HG @ torque, R_HG @ load[3:]])
 
 
@@ -110,20 +111,9 @@ class Chain:
     t: np.ndarray  # u x b
     L: float  # distance of the hands
 
-    @property
-    def h(self) -> np.ndarray:
-        """h_1, h_2 of (1) -> (2, 6)."""
-        moments = self.m + np.cross(self.p - self.c, self.f)
-        return np.hstack([moments, self.f])
-
-    @property
-    def couples(self) -> np.ndarray:
-        """What each hand puts on the valve about u -> (2,) [N m]."""
-        return -(self.h[:, :3] @ self.u)
-
-    @property
-    def torque(self) -> float:
-        return float(np.sum(self.couples))
+    h: np.ndarray  # h_1, h_2 of (1) (2, 6)
+    couples: np.ndarray  # what each hand puts on the valve about u (2,) [N m]
+    torque: float  # their sum
 
 
 def make_chain(p: np.ndarray, wrenches: np.ndarray, u: np.ndarray) -> Chain:
@@ -133,7 +123,10 @@ def make_chain(p: np.ndarray, wrenches: np.ndarray, u: np.ndarray) -> Chain:
     line = line - u * (u @ line)
     L = float(np.linalg.norm(line))
     b = line / L
-    return Chain(p, wrenches[:, 3:], wrenches[:, :3], c, u, b, np.cross(u, b), L)
+    m, f = wrenches[:, :3], wrenches[:, 3:]
+    h = np.hstack([m + [cross(p[k] - c, f[k]) for k in range(2)], f])
+    couples = -(h[:, :3] @ u)
+    return Chain(p, f, m, c, u, b, cross(u, b), L, h, couples, float(couples.sum()))
 
 
 def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, extra: np.ndarray) -> np.ndarray:
@@ -216,10 +209,12 @@ class HybridRotation:
         self, time: float, dt: float, memory: Memory, state: RobotState, mode: ModeState, plan: GraspPlan
     ) -> tuple[Memory, Command]:
         """One tick of length dt -> memory (with status and telemetry), command."""
+        if mode.mode not in AT_VALVE:
+            return (memory if memory.activation < 0 else dc.replace(memory, activation=-1, status=Status())), Command(time=time)
         q = (state.left_arm, state.right_arm)
         X = tuple(self.geometry.arm_forward(q[k], side) for k, side in enumerate(SIDES))
         m = self._sense(dt, memory, state, mode, X)
-        if mode.mode not in (Mode.GRASP, Mode.TURN, Mode.RELEASE):
+        if mode.mode in (Mode.REACH, Mode.SERVO):
             return dc.replace(m, activation=-1, status=Status()), Command(time=time)
         p = np.array([X[0][:, 3], X[1][:, 3]])
         u = -plan.X_BV[:, 2]  # H and B have the same axes while the waist is at zero
@@ -280,7 +275,7 @@ class HybridRotation:
     def _angle(self, m: Memory, chain: Chain) -> Memory:
         """Angle of the line between the hands about u since b0, unwrapped."""
         b0 = m.b0 - chain.u * (chain.u @ m.b0)
-        now = float(np.arctan2(chain.u @ np.cross(b0, chain.b), b0 @ chain.b))
+        now = float(np.arctan2(chain.u @ cross(b0, chain.b), b0 @ chain.b))
         return dc.replace(m, turned=m.turned + wrap(now - m.turned))
 
     # ------------------------------------------------------------ grasp
@@ -445,7 +440,7 @@ class HybridRotation:
         for k in range(2):
             w, v = V[k, :3], V[k, 3:]
             R, p = m.X[k][:, :3], m.X[k][:, 3]
-            X.append(make(rotation(w * dt) @ R, p + dt * (v + np.cross(w, p - chain.c))))
+            X.append(make(rotation(w * dt) @ R, p + dt * (v + cross(w, p - chain.c))))
         return self._command(m, tuple(X))
 
     def _command(self, m: Memory, X: tuple) -> Memory:

@@ -62,6 +62,7 @@ class KinematicApproachConfig:
     mark_ratio: float = 0.9  # sqrt(area) of the green mark over the taught one at which reaching ends
     opening: float = 0.085  # gripper open [m]
     gripper_force: float = 40.0  # while opening [N]
+    stance_period: float = 0.5  # between two searches for the stance [s]
     angle_tolerance: float = 0.035  # camera angle against the command that counts as turned [rad]
 
     def check(self) -> None:
@@ -84,6 +85,7 @@ class Memory:
     seen: int = -1  # sequence of the newest estimate used
     stance_looks: tuple[RectangleEstimate, ...] = ()
     stance: Stance = Stance()
+    stance_at: float = -1e9  # when it was looked for [s]
     X_OV0: np.ndarray | None = None  # the valve before the turn
     plan: GraspPlan = GraspPlan()
     status: Status = Status()
@@ -203,6 +205,9 @@ class KinematicApproach:
             return m
         looks = (*m.stance_looks, estimate)[-5:]
         m = dc.replace(m, seen=estimate.sequence, stance_looks=looks)
+        if m.stance.found and time - m.stance_at < self.config.stance_period:
+            return m
+        m = dc.replace(m, stance_at=time)
         fused = fuse(looks)
         if not fused.found:
             return m

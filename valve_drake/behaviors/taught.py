@@ -56,7 +56,11 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
                 raise ConfigError(f"{key} must be {shape} numbers") from error
             require(value.shape == shape and bool(np.isfinite(value).all()), key, f"{shape} finite numbers", value.tolist())
             values[name] = float(value) if shape == () else value
-        out[side] = TaughtReference(**values)
+        require(values["area"] > 0, f"taught references {path}: {side}.area", "> 0", values["area"])
+        try:
+            out[side] = TaughtReference(**values)
+        except ConfigError as error:
+            raise ConfigError(f"taught references {path}: {side}: {error}") from error
     return out
 
 

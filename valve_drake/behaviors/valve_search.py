@@ -2,11 +2,10 @@
 
 Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base while searching.
 
-    search   The gaze (waist + neck yaw) sweeps to one end and across, the base turns by half a turn to that side, so that
-             the gaze goes on over what is new, and it sweeps back: that is a round, one for each neck pitch in
-             `pitches`. A sighting stops the sweep and is centred; it counts
-             when the last `sightings` of stage 1 agree within 3 sigma or 5 % of the distance, else the sweep goes on.
-             Fails with not_found after the last round.
+    search   The gaze (waist + neck yaw) sweeps to one end and across, the base turns by half a turn to that side, so
+             that the gaze goes on over what is new, and it sweeps back: that is a round, one for each neck pitch in
+             `pitches`. A sighting stops the sweep and is centred; it counts when the last `sightings` of stage 1 agree
+             within 3 sigma or 5 % of the distance, else the sweep goes on. Fails with not_found after the last round.
     others   The neck keeps the last known p_OV on the optical axis of the left camera, the waist comes back to zero;
              only while driving it helps when the neck is at its end.
              Without a sighting for `lost_after` while driving or measuring: failed with marker_lost.
@@ -52,7 +51,7 @@ class ValveSearchConfig:
     sightings: int = 3  # that must agree
     spread: float = 0.05  # agreement: this share of the distance, or 3 sigma
     confirm_time: float = 1.0  # a sighting has to be confirmed within [s]
-    skip_time: float = 0.5  # then sightings are ignored while the sweep moves on [s]
+    skip_time: float = 0.5  # then images are ignored while the sweep moves on [s]
     lost_after: float = 2.0  # without a sighting while driving or measuring [s]
     jump: float = 0.5  # a sighting this far from the last is believed only when the old place is empty [m]
     jump_after: float = 0.5  # for so long [s]
@@ -98,7 +97,7 @@ class Memory:
     turn_rate: float = 0.0  # commanded [rad/s]
     looks: tuple[tuple[np.ndarray, float], ...] = ()  # p_OV [m] and its sigma [m], of the last sightings
     confirm_until: float = -np.inf  # [s]
-    ignore_until: float = -np.inf  # [s]
+    ignore_until: float = -np.inf  # capture time [s]
 
 
 def aim(
@@ -106,9 +105,9 @@ def aim(
 ) -> np.ndarray:
     """Neck pitch and yaw that bring p_OV onto the left camera's optical axis -> (2,).
 
-    Fixed-point iteration from `torso`: turn by the difference of azimuth and elevation between the axis and the line to
-    the point. Exact but for the eye's offset from the neck, so each pass divides the error by distance over offset (> 6);
-    the caller starts from its last result. Joint limits are the caller's.
+    Fixed-point iteration from `torso`: turn by the difference of azimuth and elevation between the axis and the line
+    to the point. Exact but for the eye's offset from the neck, so each pass divides the error by distance over offset
+    (> 6); the caller starts from its last result. Joint limits are the caller's.
     """
     waist, pitch, yaw = torso
     for _ in range(iterations):
@@ -273,7 +272,7 @@ def _search(
 
 def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPosition) -> Memory:
     """Takes a new sighting of both cameras, and decides whether the last ones agree."""
-    if not position.found or position.time <= max(m.capture_time, m.since) or time < m.ignore_until:
+    if not position.found or position.time <= max(m.capture_time, m.since, m.ignore_until):
         return m
     p_OV = apply(position.X_OL, position.p_LV)
     if not np.all(np.isfinite(p_OV)):

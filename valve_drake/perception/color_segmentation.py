@@ -20,8 +20,9 @@ _RED = np.array([[2.0, -1.0, -1.0]], np.float32) / 4  # opponent channels of RGB
 _GREEN = np.array([[-1.0, 2.0, -1.0]], np.float32) / 4
 
 
-_EVERY = {mode: 1 for mode in ("search", "rough_approach", "fine_approach", "measure", "verify")}
-_EVERY |= {mode: 8 for mode in ("reach", "servo", "grasp", "turn", "release", "retreat")}
+_EVERY = {mode: 1 for mode in ("search", "measure", "verify")}
+_EVERY |= {mode: 2 for mode in ("rough_approach", "fine_approach")}  # odometry is good for a quarter of a second
+_EVERY |= {mode: 16 for mode in ("reach", "servo", "grasp", "turn", "release", "retreat")}  # for the log
 _EVERY |= {mode: 0 for mode in ("idle", "done", "failed", "stopped")}
 
 
@@ -129,12 +130,17 @@ def _half_a(image: np.ndarray) -> np.ndarray:
 
 
 def _contrast(a: np.ndarray, config: ColorSegmentationConfig, sign: int) -> np.ndarray:
-    """Largest excess of a* (sign > 0), or lack of it, over the means of both neighbourhoods; uint8."""
+    """Largest excess of a* (sign > 0), or lack of it, over the means of both neighbourhoods; uint8.
+
+    Beyond the image's median a* the opposite colour does not count: grey beside red is not green.
+    """
+    counts = cv2.calcHist([a], [0], None, [256], [0, 256])[:, 0]
+    median = float(np.searchsorted(np.cumsum(counts), a.size / 2))
+    a = cv2.max(a, median) if sign > 0 else cv2.min(a, median)
     out = None
     for box in (config.small_box, config.large_box):
-        side = (box // 2) | 1
         # A neighbourhood larger than the image would read past its reflection.
-        side = min(side, 2 * min(a.shape) - 1)
+        side = min((box // 2) | 1, 2 * min(a.shape) - 1)
         mean = cv2.blur(a, (side, side), borderType=cv2.BORDER_REFLECT)
         excess = cv2.subtract(a, mean) if sign > 0 else cv2.subtract(mean, a)
         out = excess if out is None else cv2.max(out, excess)

@@ -18,7 +18,8 @@ from valve_drake.perception.color_segmentation import (
     polygon_area,
     quadrilateral,
 )
-from valve_drake.perception.line_fitting import LineFittingConfig, fit_quad, meet, side_lines
+from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads, meet, side_lines
+from valve_drake.perception.marker import NEXT
 
 
 @dc.dataclass
@@ -33,13 +34,18 @@ class HandleMarkerConfig:
     max_aspect: float = 4.0  # long side over short side in the image
     center_weight: float = 1.0  # how much nearness to the image's centre counts against size
     every: dict[str, int] = dc.field(
-        default_factory=lambda: {"reach": 1, "servo": 1, "grasp": 8}
+        default_factory=lambda: {"reach": 4, "servo": 1, "grasp": 16}
     )  # mode -> look every n-th step; 0 or missing = never
 
     def check(self) -> None:
         self.segmentation.check()
         self.lines.check()
-        for name, low, high in (("border", 0, 100), ("min_fill", 0.3, 1), ("max_aspect", 1, 20), ("center_weight", 0, 100)):
+        for name, low, high in (
+            ("border", 0, 100),
+            ("min_fill", 0.3, 1),
+            ("max_aspect", 1, 20),
+            ("center_weight", 0, 100),
+        ):
             require_in(getattr(self, name), low, high, f"handle_marker.{name}")
         check_every(self.every, "handle_marker.every")
 
@@ -75,13 +81,14 @@ def _judge(image: np.ndarray, region: Region, config: HandleMarkerConfig) -> Han
     corners = quadrilateral(region.contour)
     if corners is None:
         return HandleMark(reason="corners: not four")
-    sides = np.linalg.norm(corners[[1, 2, 3, 0]] - corners, axis=1)
+    sides = np.linalg.norm(corners[NEXT] - corners, axis=1)
+    lengths = sorted((sides[0] + sides[2], sides[1] + sides[3]))
     fill = region.area / (polygon_area(corners) + sides.sum() / 2 + 1)
     if min(fill, 1 / fill) < config.min_fill:
         return HandleMark(reason=f"fill: {fill:.2f}")
-    if max(sides[0] + sides[2], sides[1] + sides[3]) > config.max_aspect * min(sides[0] + sides[2], sides[1] + sides[3]):
+    if lengths[1] > config.max_aspect * lengths[0]:
         return HandleMark(reason="aspect")
-    quad = fit_quad(image, corners, config.lines)
+    quad = fit_quads([image], [corners], config.lines)[0]
     if quad.reason:
         return HandleMark(reason=quad.reason)
     fitted = meet(side_lines(quad.points, quad.side)[0])

@@ -78,21 +78,22 @@ def fit_pair(
         chosen = [single(seen.candidates, lens, marker, matching) for seen, lens in sides]
         if min(chosen) >= 0:  # both see one, but not the same: neither can be trusted
             chosen = [-1, -1]
-    quads = [_edges_of(seen, k, lens, config, found.reason) for (seen, lens), k in zip(sides, chosen)]
+    sides = [(seen, lens, seen.candidates[k]) if k >= 0 else None for (seen, lens), k in zip(sides, chosen)]
+    used = [one for one in sides if one is not None]
+    raw = iter(fit_quads([seen.frame.image for seen, _, _ in used], [c.corners for _, _, c in used], config))
+    quads = [
+        QuadEdges(reason=found.reason)
+        if one is None
+        else _edges_of(next(raw), one[2], one[0].green, one[1], config.max_sigma)
+        for one in sides
+    ]
     return MarkerEdges(time=pair.time, sequence=pair.sequence, left=quads[0], right=quads[1])
 
 
-def _edges_of(seen: Segmentation, k: int, lens: LensModel, config: LineFittingConfig, reason: str) -> QuadEdges:
-    if k < 0:
-        return QuadEdges(reason=reason)
-    return fit_marker(seen.frame.image, seen.candidates[k], seen.green, lens, config)
-
-
-def fit_marker(
-    image: np.ndarray, candidate: MarkerCandidate, green: np.ndarray, lens: LensModel, config: LineFittingConfig
+def _edges_of(
+    raw: RawQuad, candidate: MarkerCandidate, green: np.ndarray, lens: LensModel, max_sigma: float
 ) -> QuadEdges:
-    """Edge points of a candidate in ideal coordinates. image: (H, W, 3) uint8 RGB; green: (n, 3) as in Segmentation."""
-    raw = fit_quad(image, candidate.corners, config)
+    """The edge points in ideal coordinates, if straight lines through them make a quadrilateral."""
     if raw.reason:
         return QuadEdges(reason=raw.reason, center_px=candidate.center)
     points = lens.normalize(raw.points)
@@ -100,7 +101,7 @@ def fit_marker(
     corners = meet(lines)
     if not np.isfinite(corners).all():
         return QuadEdges(reason="sides do not meet", center_px=candidate.center)
-    if scatter * lens.focal() > config.max_sigma:
+    if scatter * lens.focal() > max_sigma:
         return QuadEdges(reason=f"sides not straight: {scatter * lens.focal():.2f} px", center_px=candidate.center)
     return QuadEdges(
         found=True,
@@ -114,20 +115,32 @@ def fit_marker(
     )
 
 
-def fit_quad(image: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> RawQuad:
-    """Edge points of the quadrilateral near `corners` (4, 2), clockwise as seen [px], within about 2 px of it."""
-    low = np.maximum(np.floor(corners.min(0)).astype(int) - _PAD, 0)
-    high = np.minimum(np.ceil(corners.max(0)).astype(int) + _PAD + 1, [image.shape[1], image.shape[0]])
-    if (high - low < 6).any():
-        return RawQuad(reason="outside of the image")
-    local = corners - low
-    channel, contrast = _mix(image[low[1] : high[1], low[0] : high[0]], local, config)
-    if contrast < config.min_contrast:
-        return RawQuad(reason=f"contrast: {contrast:.0f}")
-    fitted = _fit_sides(channel, _hough_corners(channel, local), config)
-    if fitted.reason:
-        return fitted
-    return dc.replace(fitted, points=fitted.points + low)
+def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: LineFittingConfig) -> list[RawQuad]:
+    """Edge points of one quadrilateral in each image (H, W, 3) uint8 RGB, within about 2 px of corners (4, 2) [px].
+
+    Corners go clockwise as seen. All are fitted in one pass, which costs little more than one.
+    """
+    out: list[RawQuad] = []
+    parts = []
+    for k, (image, near) in enumerate(zip(images, corners)):
+        low = np.maximum(np.floor(near.min(0)).astype(int) - _PAD, 0)
+        high = np.minimum(np.ceil(near.max(0)).astype(int) + _PAD + 1, [image.shape[1], image.shape[0]])
+        out.append(RawQuad(reason="outside of the image"))
+        if (high - low < 6).any():
+            continue
+        channel, contrast = _mix(image[low[1] : high[1], low[0] : high[0]], near - low, config)
+        if contrast < config.min_contrast:
+            out[k] = RawQuad(reason=f"contrast: {contrast:.0f}")
+            continue
+        sides = _place(channel, _hough_corners(channel, near - low), config)
+        if isinstance(sides, str):
+            out[k] = RawQuad(reason=sides)
+        else:
+            parts.append((k, low, sides))
+    if parts:
+        for (k, low, _), raw in zip(parts, _fit_sides([sides for _, _, sides in parts], config)):
+            out[k] = raw if raw.reason else dc.replace(raw, points=raw.points + low)
+    return out
 
 
 def side_lines(points: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]:
@@ -212,62 +225,91 @@ def _hough_corners(channel: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return refined if ok else corners
 
 
-def _fit_sides(channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> RawQuad:
-    """Step 3: all four sides together, as arrays (4 sides, N profiles, M pixels)."""
+@dc.dataclass(frozen=True)
+class _Sides:
+    """The profiles of four sides before the fit: everything (4, ...) or (4,)."""
+
+    channel: np.ndarray  # (H, W) float32
+    flat: np.ndarray  # profiles are columns of the image (t is u), else rows (t is v)
+    first: np.ndarray  # t of the first profile
+    count: np.ndarray  # profiles
+    start: np.ndarray  # position across the side at t = 0 ...
+    slope: np.ndarray  # ... and its change with t
+    inward: np.ndarray  # +-1: the way across the side that leads inside
+    half: int  # of a profile [px]
+
+
+def _place(channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> _Sides | str:
+    """Lays the profiles across the sides of a coarse quadrilateral; or why it cannot."""
     ends = corners[NEXT]
     along = ends - corners
     lengths = np.linalg.norm(along, axis=1)
     if lengths.min() < 4:
-        return RawQuad(reason="small")
-    flat = np.abs(along[:, 0]) >= np.abs(along[:, 1])  # profiles are columns; else rows
+        return "small"
+    flat = np.abs(along[:, 0]) >= np.abs(along[:, 1])
+    four = np.arange(4)
     t_axis = np.where(flat, 0, 1)
-    rows = np.arange(4)
-    run = along[rows, t_axis]
-    slope = along[rows, 1 - t_axis] / run
+    slope = along[four, 1 - t_axis] / along[four, t_axis]
     cosine = 1 / np.sqrt(1 + slope**2)
-    inward = np.sign(corners.mean(0)[1 - t_axis] - (corners + ends)[rows, 1 - t_axis] / 2)
     # A profile must reach neither the opposite side nor the rim of the light plate round the marker.
     width = polygon_area(corners) / lengths.max()
     half = int(np.clip(round(0.12 * width), 3, config.half_window))
     # The light plate is narrowest at the corners, which only small markers feel.
     reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 4.0)) + half * np.abs(slope) * cosine
-    begin = np.minimum(corners[rows, t_axis], ends[rows, t_axis]) + reach * cosine
-    stop = np.maximum(corners[rows, t_axis], ends[rows, t_axis]) - reach * cosine
+    begin = np.minimum(corners[four, t_axis], ends[four, t_axis]) + reach * cosine
+    stop = np.maximum(corners[four, t_axis], ends[four, t_axis]) - reach * cosine
     limit = np.where(flat, channel.shape[1], channel.shape[0]) - 1
     first = np.maximum(np.ceil(begin), 0).astype(int)
     count = np.minimum(np.floor(stop), limit).astype(int) - first + 1
     if count.min() < 3:
-        return RawQuad(reason=f"side {int(np.argmin(count))} short")
+        return f"side {int(np.argmin(count))} short"
+    start = corners[four, 1 - t_axis] - slope * corners[four, t_axis]
+    inward = np.sign(corners.mean(0)[1 - t_axis] - (corners + ends)[four, 1 - t_axis] / 2)
+    return _Sides(channel, flat, first, count, start, slope, inward, half)
+
+
+def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
+    """Step 3: the sides of all quadrilaterals together, as arrays (S sides, N profiles, M pixels)."""
+    flat, first, count, start, slope, inward = (
+        np.concatenate([getattr(q, name) for q in quads])
+        for name in ("flat", "first", "count", "start", "slope", "inward")
+    )
+    half = np.repeat([float(q.half) for q in quads], 4)
+    tall, wide = (np.repeat([q.channel.shape[k] for q in quads], 4)[:, None, None] for k in (0, 1))
+    pixels = np.concatenate([q.channel.ravel() for q in quads])
+    origin = np.repeat(np.cumsum([0] + [q.channel.size for q in quads[:-1]]), 4)[:, None, None]
+    cosine = 1 / np.sqrt(1 + slope**2)
 
     k = np.arange(count.max())
-    t = first[:, None] + k  # (4, N)
+    t = first[:, None] + k  # (S, N)
     used = (k < count[:, None]).astype(float)
     tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1 along each side
-    curve = corners[rows, 1 - t_axis][:, None] + slope[:, None] * (t - corners[rows, t_axis][:, None])
-    y = np.rint(curve)[:, :, None] + np.arange(-half - 2, half + 3)  # (4, N, M)
-    across = np.where(flat, channel.shape[0], channel.shape[1]) - 1
-    in_image = (y >= 0) & (y <= across[:, None, None])
+    curve = start[:, None] + slope[:, None] * t
+    reach = int(half.max()) + 2
+    y = np.rint(curve)[:, :, None] + np.arange(-reach, reach + 1)  # (S, N, M)
+    columns = flat[:, None, None]
+    in_image = (y >= 0) & (y < np.where(columns, tall, wide))
     yi = np.where(in_image, y, 0).astype(int)
-    ti = np.minimum(t, limit[:, None])[:, :, None]
-    index = np.where(flat[:, None, None], yi * channel.shape[1] + ti, ti * channel.shape[1] + yi)
-    f = channel.ravel()[index]  # float32, as all arrays per pixel: they are large and need no more
+    ti = np.minimum(t[:, :, None], np.where(columns, wide, tall) - 1)
+    f = pixels[origin + np.where(columns, yi * wide + ti, ti * wide + yi)]  # float32, as all that is per pixel
 
-    basis = np.stack([np.ones_like(tau), tau, tau**2 - 1 / 3], -1)  # (4, N, 3)
+    basis = np.stack([np.ones_like(tau), tau, tau**2 - 1 / 3], -1)  # (S, N, 3)
     bend = np.where(count >= 24, 1e-9, 1e9)  # short sides show no curvature of the lens
     valid = (used[:, :, None] * in_image).astype(np.float32)
-    good, blur, last = used, 1.0, False
+    good, blur, last = used, np.full(len(count), 1.0), False
+    has_step = np.full(len(count), True)
     for step in range(config.iterations):
         offset = (y - curve[:, :, None]).astype(np.float32)
-        weight = valid * np.clip(half + 1 - np.abs(offset), 0, 1)  # no pixel enters or leaves at once
+        # No pixel enters or leaves at once.
+        weight = valid * np.clip((half + 1).astype(np.float32)[:, None, None] - np.abs(offset), 0, 1)
         z = (inward * cosine / blur).astype(np.float32)[:, None, None] * offset
         bell = np.exp(-0.5 * z * z) * np.float32(1 / np.sqrt(2 * np.pi))
         rise = _normal_cdf(z, bell)
         level = _levels(weight, good, rise, f, tau)
-        if (level[:, 2] < 0.3).any():
-            return RawQuad(reason=f"side {int(np.argmin(level[:, 2]))} has no step")
-        base, height = level[:, 0:1] + level[:, 1:2] * tau, level[:, 2:3] + level[:, 3:4] * tau  # (4, N)
-        base, height = base.astype(np.float32), height.astype(np.float32)
-        gain = (height / np.float32(blur))[:, :, None] * bell
+        has_step &= level[:, 2] >= 0.3
+        base = (level[:, 0:1] + level[:, 1:2] * tau).astype(np.float32)
+        height = np.maximum(level[:, 2:3] + level[:, 3:4] * tau, 0.05).astype(np.float32)  # (S, N)
+        gain = (height / blur[:, None]).astype(np.float32)[:, :, None] * bell
         residual = f - base[:, :, None] - height[:, :, None] * rise
         pull = weight * gain
         strength = _dot(pull, gain) + 1e-12
@@ -277,64 +319,77 @@ def _fit_sides(channel: np.ndarray, corners: np.ndarray, config: LineFittingConf
         before = blur
         if step > 0:
             pull *= z  # weight times -d model / d blur
-            blur -= float((good * _dot(pull, left)).sum() / (good * _dot(pull, gain * z)).sum())
-            blur = min(max(blur, 0.35), 3.0)
+            wrong, scale = (good * _dot(pull, left)).sum(1), (good * _dot(pull, gain * z)).sum(1)
+            change = wrong.reshape(-1, 4).sum(1) / np.maximum(scale.reshape(-1, 4).sum(1), 1e-12)
+            blur = np.clip(blur - np.repeat(change, 4), 0.35, 3.0)
         typical = _median(square, used)
         good = used * (square < 6 * typical[:, None] + 4e-4) * (strength > 0.2 * strength.max(1, keepdims=True))
-        shift = np.clip(shift, -1.5, 1.5)
-        moved = (inward / cosine)[:, None] * shift
+        moved = (inward / cosine)[:, None] * np.clip(shift, -1.5, 1.5)
         rounds = 2 if last else 1  # outliers are looked for once the model is near
         smooth, good = _smooth(basis, moved, good, bend, np.sqrt(typical[:, None] / strength), rounds)
         if last:
             break
         curve = curve + smooth
-        settled = step > 0 and np.abs(used * smooth).max() < 0.01 and abs(blur - before) < 0.01
+        settled = step > 0 and np.abs(used * smooth).max() < 0.01 and np.abs(blur - before).max() < 0.01
         last = settled or step == config.iterations - 2
-    deviation = (moved - smooth) * cosine[:, None]
-    share = good.sum(1) / count
-    if share.min() < config.min_share or good.sum(1).min() < 3:
-        return RawQuad(reason=f"side {int(np.argmin(share))}: {share.min():.2f} of it fits")
-    predicted = float((good * typical[:, None] / strength).sum() / good.sum())
-    freedom = good.sum() - 8 - 4 * (bend < 1).mean()
-    sigma = np.sqrt(((good * deviation**2).sum() + _PRIOR_POINTS * predicted) / (freedom + _PRIOR_POINTS))
-    if sigma > config.max_sigma:
-        return RawQuad(reason=f"sides not straight: {sigma:.2f} px")
     edge = curve + moved
-    keep = good > 0
-    points = np.where(flat[:, None, None], np.stack([t, edge], -1), np.stack([edge, t], -1))
-    side = np.broadcast_to(rows[:, None], keep.shape)
-    return RawQuad(points=points[keep], side=side[keep], sigma=float(sigma), blur=blur)
+    points = np.where(columns, np.stack([t, edge], -1), np.stack([edge, t], -1))
+    deviation = good * ((moved - smooth) * cosine[:, None]) ** 2
+    predicted = good * typical[:, None] / strength
+    out = []
+    for q in range(len(quads)):
+        own = slice(4 * q, 4 * q + 4)
+        keep = good[own] > 0
+        share = keep.sum(1) / count[own]
+        n = int(keep.sum())
+        freedom = n - 8 - int((bend[own] < 1).sum())
+        sigma = np.sqrt(
+            (deviation[own].sum() + _PRIOR_POINTS * predicted[own].sum() / max(n, 1)) / (freedom + _PRIOR_POINTS)
+        )
+        reason = ""
+        if not has_step[own].all():
+            reason = f"side {int(np.argmin(has_step[own]))} has no step"
+        elif share.min() < config.min_share or keep.sum(1).min() < 3:
+            reason = f"side {int(np.argmin(share))}: {share.min():.2f} of it fits"
+        elif not sigma <= config.max_sigma:
+            reason = f"sides not straight: {sigma:.2f} px"
+        if reason:
+            out.append(RawQuad(reason=reason))
+            continue
+        side = np.broadcast_to(np.arange(4)[:, None], keep.shape)[keep]
+        out.append(RawQuad(points=points[own][keep], side=side, sigma=float(sigma), blur=float(blur[4 * q])))
+    return out
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Sum over the pixels of each profile: (4, N, M), (4, N, M) -> (4, N)."""
+    """Sum over the pixels of each profile: (S, N, M), (S, N, M) -> (S, N)."""
     return np.einsum("snm,snm->sn", a, b)
 
 
 def _levels(weight: np.ndarray, good: np.ndarray, rise: np.ndarray, f: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """Least squares of f = (b0 + b1 tau) + (a0 + a1 tau) rise on each side -> (4, 4): b0, b1, a0, a1."""
+    """Least squares of f = (b0 + b1 tau) + (a0 + a1 tau) rise on each side -> (S, 4): b0, b1, a0, a1."""
     risen = weight * rise
     sums = np.stack([weight.sum(-1), risen.sum(-1), _dot(risen, rise)]) * good  # of 1, rise, rise^2 in each profile
     right = np.stack([_dot(weight, f), _dot(risen, f)]) * good
     powers = np.stack([np.ones_like(tau), tau, tau * tau])
     m = np.einsum("asn,psn->sap", sums, powers)
-    r = np.einsum("asn,psn->sap", right, powers[:2]).reshape(4, 4)
+    r = np.einsum("asn,psn->sap", right, powers[:2]).reshape(-1, 4)
     normal = m[:, [[0, 0, 1, 1], [0, 0, 1, 1], [1, 1, 2, 2], [1, 1, 2, 2]], _TAU_POWER]
     # A short side shows no trend: hold it near zero there.
     return np.linalg.solve(normal + np.diag([1e-9, 0.1, 1e-9, 0.1]), r[:, :, None])[:, :, 0]
 
 
 def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Upper median of the used entries in each row: (4, N), (4, N) -> (4,)."""
+    """Upper median of the used entries in each row: (S, N), (S, N) -> (S,)."""
     ordered = np.sort(np.where(used > 0, values, np.inf), axis=1)
-    return ordered[np.arange(4), (used > 0).sum(1) // 2]
+    return ordered[np.arange(len(ordered)), np.minimum((used > 0).sum(1) // 2, ordered.shape[1] - 1)]
 
 
 def _smooth(
     basis: np.ndarray, moved: np.ndarray, good: np.ndarray, bend: np.ndarray, noise: np.ndarray, rounds: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Robust curve through the profiles' shifts (4, N): its values, and which profiles belong to it."""
-    prior = np.zeros((4, 3, 3))
+    """Robust curve through the profiles' shifts (S, N): its values, and which profiles belong to it."""
+    prior = np.zeros((len(bend), 3, 3))
     prior[:, [0, 1], [0, 1]] = 1e-9
     prior[:, 2, 2] = bend
     for _ in range(rounds):

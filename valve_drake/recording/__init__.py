@@ -1,1 +1,5 @@
-"""The log: what is written (signals, schemas, foxglove, scene, layout), writing it (recorder_system, writer), reading it (reader)."""
+"""The log.
+
+What is written: signals, schemas, foxglove, scene, robot_frames, layout. Writing it: recorder_system, writer,
+container. Reading it: reader.
+"""

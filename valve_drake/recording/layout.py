@@ -24,7 +24,9 @@ PLOTS: dict[str, dict[str, str]] = {  # title -> label -> message path
         "couple": "/hybrid_rotation/turn.torque",
         "squeeze": "/hybrid_rotation/turn.squeeze",
     },
-    "Servo error [m]": {f"{side} {'xyz'[k]}": f"/image_servo/servo.{side}_error[{k}]" for side in SIDES for k in range(3)},
+    "Servo error [m]": {
+        f"{side} {'xyz'[k]}": f"/image_servo/servo.{side}_error[{k}]" for side in SIDES for k in range(3)
+    },
     "Joint tracking [rad]": {
         f"{side} {k} {topic.removeprefix('joint_')}": JOINT.format(topic=topic, side=side, k=k)
         for side in SIDES

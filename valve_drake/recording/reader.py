@@ -191,7 +191,9 @@ class LogReader:
         if not self._ended:
             return size
         footer = Footer.read(ReadDataStream(BytesIO(self._data[footer_at + _HEAD.size : size])))
-        if zlib.crc32(self._data[footer.summary_start : size - len(MAGIC) - 4]) != footer.summary_crc:
+        if footer.summary_start == 0:
+            return footer_at
+        if footer.summary_crc not in (0, self._crc(footer.summary_start, size - len(MAGIC) - 4)):
             self.damage.append("the summary is damaged; the messages were read without it")
             return size
         position = footer.summary_start
@@ -215,21 +217,23 @@ class LogReader:
                 gaps.append((len(self._chunks), after - position))
             else:
                 complete = isinstance(record, DataEnd)
-            if complete and not gaps and not self.damage and record.data_section_crc not in (0, self._crc(0, position)):
-                self.damage.append("a few bytes are damaged, none of a message: the CRC of the whole does not match")
+                if complete and not gaps and record.data_section_crc not in (0, self._crc(0, position)):
+                    self.damage.append("bytes outside the messages are damaged: the CRC of the whole does not match")
             position = after
         if not self._ended and not complete and gaps and position == limit:
             gaps.pop()  # the torso of the last record
         for chunks, size in gaps:
             before = f"after t = {self._chunks[chunks - 1].end / NANO:.3f} s" if chunks > 0 else "at the beginning"
-            on = f", sound again from t = {self._chunks[chunks].start / NANO:.3f} s" if chunks < len(self._chunks) else ""
-            self.damage.append(f"{size} bytes are damaged {before}{on}")
+            after = ""
+            if chunks < len(self._chunks):
+                after = f", sound again from t = {self._chunks[chunks].start / NANO:.3f} s"
+            self.damage.append(f"{size} bytes are damaged {before}{after}")
         if not self._ended:
             last = f"t = {self._chunks[-1].end / NANO:.3f} s" if self._chunks else "its beginning"
             self.damage.append(f"the log breaks off after {last}: killed, cut off or still being written")
 
     def _record(self, position: int) -> tuple[McapRecord | None, int]:
-        """The record at `position` (None: an index, not needed) and where the next begins. Raises if it is not sound."""
+        """The record at `position` (None: an index, not needed), and where the next begins; raises if not sound."""
         opcode, length = _HEAD.unpack_from(self._data, position)
         start = position + _HEAD.size
         end = start + length
@@ -241,7 +245,8 @@ class LogReader:
         record = _KINDS[opcode].read(stream)
         if stream.count != length:
             raise ValueError("a record's length does not match its content")
-        if opcode == Opcode.ATTACHMENT and self._crc(start, end - 4) != int.from_bytes(self._data[end - 4 : end], "little"):
+        stored = int.from_bytes(self._data[end - 4 : end], "little")
+        if opcode == Opcode.ATTACHMENT and stored != self._crc(start, end - 4):
             raise ValueError("an attachment's CRC does not match")
         return record, end
 

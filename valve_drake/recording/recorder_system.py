@@ -81,12 +81,10 @@ class RecorderSystem(LeafSystem):
             time = context.get_time()
             tick = round(time / TICK)
             for row in self._rows:
-                if row.due(tick):
-                    values = tuple([port.read(context, self._publishes) for port in row.ports])
-                    if row.news(values):
-                        self._write(row.signal, time, values)
+                if row.due(tick) and (values := row.news(context, self._publishes)) is not None:
+                    self._write(row.signal, time, values)
 
-    def _write(self, signal: Signal, time: float, values: tuple) -> None:
+    def _write(self, signal: Signal, time: float, values: list) -> None:
         message = signal.encode(time, *values)
         if message is not None:
             self._sink.write(signal.topic, message, time)
@@ -126,16 +124,18 @@ class _Row:
         self.signal = signal
         self.ports = ports
         self._every = 0 if signal.period == ONCE else round(signal.period / TICK)  # [ticks]
+        self._key = signal.key
         self._always = signal.key is None and all(isinstance(kind, int) for kind in signal.inputs.values())
         self._last: Any = None
 
     def due(self, tick: int) -> bool:
         return tick % self._every == 0 if self._every else self._last is None
 
-    def news(self, values: tuple) -> bool:
-        """Whether `values` are to be written; remembers them. Messages compare by identity."""
-        mark = values if self.signal.key is None else self.signal.key(*values)
+    def news(self, context: Context, publish: int) -> list | None:
+        """The values to write, if any. Messages compare by identity."""
+        values = [port.read(context, publish) for port in self.ports]
+        mark = values if self._key is None else self._key(*values)
         if not self._always and mark == self._last:
-            return False
+            return None
         self._last = mark
-        return True
+        return values

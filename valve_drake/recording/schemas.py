@@ -5,7 +5,7 @@ One mechanism for every subclass of messages.Message (and those of other modules
 | field of the dataclass     | protobuf field of `valve_drake.<Class>`, same name, numbered in order            |
 |----------------------------|----------------------------------------------------------------------------------|
 | float, int, bool, str, bytes | double, int64, bool, string, bytes                                             |
-| array of a declared shape  | repeated double, row-major; a length -1 follows from the number of values; None is empty |
+| array of a declared shape  | repeated double, row-major; -1 follows from the number of values; None is empty |
 | tuple[str, ...]            | repeated string                                                                  |
 | Message, tuple[Message, ...] | nested message, repeated nested message                                        |
 
@@ -16,7 +16,7 @@ A log carries its own schemas, so a reader maps fields by name: what an older lo
 
 import dataclasses as dc
 import functools
-import types
+import struct
 import typing
 from collections.abc import Callable
 from typing import Any
@@ -33,12 +33,13 @@ PACKAGE = "valve_drake"
 UNLOGGED = {messages.CameraFrame: ("image", "data")}
 
 _Field = descriptor_pb2.FieldDescriptorProto
-_SCALARS = {
-    float: _Field.TYPE_DOUBLE,
-    int: _Field.TYPE_INT64,
-    bool: _Field.TYPE_BOOL,
-    str: _Field.TYPE_STRING,
-    bytes: _Field.TYPE_BYTES,
+_ONE_BYTE = [bytes([n]) for n in range(256)]
+_SCALARS: dict[type, tuple[int, Callable[[Any], bytes], type]] = {  # protobuf's type, value -> bytes, and back
+    float: (_Field.TYPE_DOUBLE, struct.Struct("<d").pack, float),
+    int: (_Field.TYPE_INT64, lambda value: _varint(int(value) & 0xFFFF_FFFF_FFFF_FFFF), int),
+    bool: (_Field.TYPE_BOOL, lambda value: _ONE_BYTE[bool(value)], bool),
+    str: (_Field.TYPE_STRING, str.encode, str),
+    bytes: (_Field.TYPE_BYTES, bytes, bytes),
 }
 _POOL = descriptor_pool.DescriptorPool()
 
@@ -66,7 +67,7 @@ class _FieldCodec:
     name: str
     type: int  # of descriptor_pb2.FieldDescriptorProto
     repeated: bool
-    to_proto: Callable[[Any], Any]
+    put: Callable[[Any], bytes]  # the field's value as protobuf's bytes, without a tag
     from_proto: Callable[[Any], Any]
     nested: type[Message] | None = None
 
@@ -75,7 +76,7 @@ class _FieldCodec:
 class _Codec:
     proto: type[Proto]
     fields: tuple[_FieldCodec, ...]
-    encoders: tuple[tuple[str, Callable[[Any], Any]], ...]  # the fields' names and `to_proto`
+    writers: tuple[tuple[str, Callable[[Any], bytes]], ...]  # name, value -> bytes with tags
 
 
 def proto_class(kind: type[Message]) -> type[Proto]:
@@ -83,26 +84,24 @@ def proto_class(kind: type[Message]) -> type[Proto]:
     return _codec(kind).proto
 
 
-def to_proto(message: Message) -> Proto:
-    """The message as protobuf."""
-    codec = _codec(type(message))
-    return codec.proto(**{name: convert(getattr(message, name)) for name, convert in codec.encoders})
+def encode(message: Message) -> bytes:
+    """The message as the bytes that go into the log: what its protobuf class would serialise.
+
+    Written straight from the arrays: two to four times as fast as by way of the class, and it is
+    the larger part of what logging costs the loop.
+    """
+    return b"".join([write(getattr(message, name)) for name, write in _codec(type(message)).writers])
+
+
+def decode(kind: type[Message], data: bytes) -> Message:
+    """The message from bytes that `encode` made."""
+    return from_proto(kind, proto_class(kind).FromString(data))
 
 
 def from_proto(kind: type[Message], proto: Proto) -> Message:
     """The message from protobuf of this or an older schema; fields that `proto` lacks get their default."""
     found = ((f, getattr(proto, f.name, None)) for f in _codec(kind).fields)
     return kind(**{f.name: f.from_proto(value) for f, value in found if value is not None})
-
-
-def encode(message: Message) -> bytes:
-    """The message as the bytes that go into the log."""
-    return to_proto(message).SerializeToString()
-
-
-def decode(kind: type[Message], data: bytes) -> Message:
-    """The message from bytes that `encode` made."""
-    return from_proto(kind, proto_class(kind).FromString(data))
 
 
 def schema_data(proto: type[Proto]) -> bytes:
@@ -128,23 +127,20 @@ def _kinds() -> dict[str, type[Message]]:
 @functools.cache
 def _codec(kind: type[Message]) -> _Codec:
     hints = typing.get_type_hints(kind)
-    fields = tuple(
-        _field_codec(kind, f, hints[f.name]) for f in dc.fields(kind) if f.name not in UNLOGGED.get(kind, ())
-    )
+    logged = [f for f in dc.fields(kind) if f.name not in UNLOGGED.get(kind, ())]
+    fields = tuple(_field_codec(kind, f, hints[f.name]) for f in logged)
     file = descriptor_pb2.FileDescriptorProto(name=f"{PACKAGE}/{kind.__name__}.proto", package=PACKAGE, syntax="proto3")
-    file.dependency.extend(
-        sorted({proto_class(f.nested).DESCRIPTOR.file.name for f in fields if f.nested is not None})
-    )
+    file.dependency.extend(sorted({proto_class(f.nested).DESCRIPTOR.file.name for f in fields if f.nested}))
     message = file.message_type.add(name=kind.__name__)
     for number, field in enumerate(fields, start=1):
         label = _Field.LABEL_REPEATED if field.repeated else _Field.LABEL_OPTIONAL
         declared = message.field.add(name=field.name, number=number, type=field.type, label=label)
-        if field.nested is not None:
+        if field.nested:
             declared.type_name = f".{PACKAGE}.{field.nested.__name__}"
     _POOL.Add(file)
     descriptor = _POOL.FindMessageTypeByName(f"{PACKAGE}.{kind.__name__}")
-    encoders = tuple((f.name, f.to_proto) for f in fields)
-    return _Codec(message_factory.GetMessageClass(descriptor), fields, encoders)
+    writers = tuple((f.name, _writer(number, f)) for number, f in enumerate(fields, start=1))
+    return _Codec(message_factory.GetMessageClass(descriptor), fields, writers)
 
 
 def _field_codec(kind: type[Message], field: dc.Field, hint: Any) -> _FieldCodec:
@@ -152,20 +148,15 @@ def _field_codec(kind: type[Message], field: dc.Field, hint: Any) -> _FieldCodec
         return _array_codec(kind, field)
     repeated = typing.get_origin(hint) is tuple
     inner = typing.get_args(hint)[0] if repeated else hint
-    if isinstance(inner, types.GenericAlias) or not isinstance(inner, type):
+    nested = inner if isinstance(inner, type) and issubclass(inner, Message) else None
+    if nested is None and (inner not in _SCALARS or (repeated and inner is not str)):
         raise TypeError(f"{kind.__name__}.{field.name}: no protobuf for {hint}")
-    if issubclass(inner, Message):
-        back = functools.partial(from_proto, inner)
-        convert, back = (_all(to_proto), _all(back)) if repeated else (to_proto, back)
-        return _FieldCodec(field.name, _Field.TYPE_MESSAGE, repeated, convert, back, inner)
-    if inner not in _SCALARS or (repeated and inner is not str):
-        raise TypeError(f"{kind.__name__}.{field.name}: no protobuf for {hint}")
-    convert = tuple if repeated else inner
-    return _FieldCodec(field.name, _SCALARS[inner], repeated, convert, convert)
-
-
-def _all(convert: Callable[[Any], Any]) -> Callable[[Any], tuple]:
-    return lambda values: tuple(convert(value) for value in values)
+    if nested:
+        number, put, back = _Field.TYPE_MESSAGE, encode, functools.partial(from_proto, inner)
+    else:
+        number, put, back = _SCALARS[inner]
+    from_field = (lambda values: tuple(back(value) for value in values)) if repeated else back
+    return _FieldCodec(field.name, number, repeated, put, from_field, nested)
 
 
 def _array_codec(kind: type[Message], field: dc.Field) -> _FieldCodec:
@@ -174,13 +165,51 @@ def _array_codec(kind: type[Message], field: dc.Field) -> _FieldCodec:
         # Its length could not be told from the number of values, or no rows from None.
         raise TypeError(f"{kind.__name__}.{field.name}: no protobuf for an array {shape}, optional={optional}")
 
-    def flat(value: np.ndarray | None) -> list[float]:
-        return [] if value is None else value.ravel().tolist()
+    def put(value: np.ndarray | None) -> bytes:
+        return b"" if value is None else value.tobytes()
 
     def shaped(values: Any) -> np.ndarray | None:
         return None if optional and len(values) == 0 else np.array(values, dtype=np.float64).reshape(shape)
 
-    return _FieldCodec(field.name, _Field.TYPE_DOUBLE, True, flat, shaped)
+    return _FieldCodec(field.name, _Field.TYPE_DOUBLE, True, put, shaped)
+
+
+# ---- protobuf's wire format
+
+
+def _varint(n: int) -> bytes:
+    if n < 0x80:
+        return _ONE_BYTE[n]
+    return _ONE_BYTE[n & 0x7F | 0x80] + _varint(n >> 7)
+
+
+def _writer(number: int, field: _FieldCodec) -> Callable[[Any], bytes]:
+    """A field's value as tag and bytes; nothing for zeros and empty ones, as proto3 has it."""
+    put = field.put
+    sized = field.repeated or field.type in (_Field.TYPE_STRING, _Field.TYPE_BYTES, _Field.TYPE_MESSAGE)
+    wire_type = 2 if sized else 1 if field.type == _Field.TYPE_DOUBLE else 0
+    tag = _varint(number << 3 | wire_type)
+
+    def plain(value: Any) -> bytes:
+        data = put(value)
+        return tag + data if data.strip(b"\0") else b""
+
+    def with_size(value: Any) -> bytes:
+        data = put(value)
+        return tag + _varint(len(data)) + data if data else b""
+
+    def message(value: Any) -> bytes:
+        data = put(value)
+        return tag + _varint(len(data)) + data
+
+    def each(values: tuple) -> bytes:
+        return b"".join([message(value) for value in values])
+
+    if field.repeated and field.type != _Field.TYPE_DOUBLE:
+        return each
+    if field.nested:
+        return message
+    return with_size if sized else plain
 
 
 for _kind in _kinds().values():

@@ -1,7 +1,7 @@
 """The recorder's table: every topic of a log, and the makers of its rows.
 
     /<block>/<port>           a block's output as it is (schemas.py)
-    /<camera>/image           foxglove.CompressedImage: the bytes that the program decoded, of the images that it looked at
+    /<camera>/image           foxglove.CompressedImage: the bytes that the program decoded, of images that it looked at
     /<camera>/calibration     foxglove.CameraCalibration     /<camera>/detections   foxglove.ImageAnnotations
     /tf  /scene               foxglove.FrameTransforms, SceneUpdate
     /joint_states  /joint_commands   foxglove.JointStates of the station's measured and commanded vectors

@@ -15,7 +15,7 @@ from valve_drake.frames import make, rot_y, rot_z
 from valve_drake.stations.simulation_config import StartConfig, ValveConfig
 
 MARKER_RED = (0.80, 0.06, 0.05, 1.0)
-MARKER_THICKNESS = 0.002
+MARKER_THICKNESS = 1e-4  # a sticker: a plate would show its rim to a camera from above [m]
 SEIZED = 1e4  # friction of a valve that does not turn [N m]
 
 

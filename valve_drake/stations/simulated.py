@@ -6,6 +6,7 @@ of the robot alone. `truth.*` ports exist here only; the recorder alone reads th
 """
 
 import dataclasses as dc
+import math
 
 import numpy as np
 from pydrake.common.value import Value
@@ -14,7 +15,7 @@ from pydrake.systems.controllers import InverseDynamics
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, Multiplexer
 
 from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
@@ -35,65 +36,88 @@ def arm_joints(side: str) -> list[str]:
 
 
 class ServoDriver(LeafSystem):
-    """From the contract's commands to what the plant's joint servos want: [q_d; v_d] of all actuators.
+    """What must be computed at every step of the plant: set points of the base and of the fingers.
 
-    Arms and torso get v_d = 0 (the contract carries positions). The base integrates its twist; the gripper's
-    force limit is kept by never asking for a position farther away than the servo answers with that force.
+    The base integrates its twist; a gripper's force limit is kept by never asking for a position farther away than
+    the servo answers with that force. Output: q_d of base x, y, heading, left and right finger, then their v_d (10).
     """
 
-    def __init__(self, plant: MultibodyPlant, scene: Scene, start: np.ndarray):
+    def __init__(self, fingers: list[int], states: int, start: np.ndarray):
         super().__init__()
         self.set_name("servo_driver")
-        names = [plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices(scene.robot)]
-        self._n = len(names)
-        self._slots = {
-            "torso.position_command": [names.index(j) for j in TORSO],
-            **{f"{s}_arm.position_command": [names.index(j) for j in arm_joints(s)] for s in SIDES},
-        }
-        self._base = [names.index(j) for j in BASE]
-        self._finger = {side: names.index(f"{side}_finger_1") for side in SIDES}
-        self._finger_q = {
-            side: plant.GetJointByName(f"{side}_finger_1", scene.robot).position_start() for side in SIDES
-        }
-        self._ports = {
-            spec.name: self.DeclareVectorInputPort(spec.name, spec.kind) for spec in CONTRACT if spec.direction == "in"
-        }
-        self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
-        self._pose = self.DeclareDiscreteState(6)  # base set point x, y, heading; time; forward, yaw rate
+        self._fingers = fingers
+        self._twist = self.DeclareVectorInputPort("base.twist_command", 2)
+        self._opening = [self.DeclareVectorInputPort(f"{side}_gripper.position_command", 1) for side in SIDES]
+        self._limit = [self.DeclareVectorInputPort(f"{side}_gripper.force_limit", 1) for side in SIDES]
+        self._state = self.DeclareVectorInputPort("plant_state", states)
+        self._pose = self.DeclareDiscreteState(6)  # base set point x, y, heading; its time; forward, yaw rate
         self._start = start
         self.DeclareInitializationDiscreteUpdateEvent(self._begin)
         self.DeclarePeriodicDiscreteUpdateEvent(TICK, 3 * SLOT, self._integrate)
-        self.DeclareVectorOutputPort("desired_state", 2 * self._n, self._calc)
+        self.DeclareVectorOutputPort("desired", 10, self._calc)
 
     def _begin(self, context: Context, state: object) -> None:
         state.set_value(int(self._pose), np.concatenate([self._start, np.zeros(3)]))
 
-    def _at(self, context: Context) -> np.ndarray:
-        """Base set point now -> x, y, heading."""
+    def _now(self, context: Context) -> tuple[float, float, float, float, float]:
+        """Base set point x, y, heading, and the twist that moves it."""
         x, y, h, t0, v, w = context.get_discrete_state(int(self._pose)).value()
         dt = context.get_time() - t0
         middle = h + w * dt / 2
-        return np.array([x + v * dt * np.cos(middle), y + v * dt * np.sin(middle), h + w * dt])
+        return x + v * dt * math.cos(middle), y + v * dt * math.sin(middle), h + w * dt, v, w
 
     def _integrate(self, context: Context, state: object) -> None:
-        twist = self._ports["base.twist_command"].Eval(context)
-        state.set_value(int(self._pose), np.concatenate([self._at(context), [context.get_time()], twist]))
+        pose = self._now(context)[:3]
+        state.set_value(int(self._pose), [*pose, context.get_time(), *self._twist.Eval(context)])
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        q_d, v_d = np.zeros(self._n), np.zeros(self._n)
-        for name, slots in self._slots.items():
-            q_d[slots] = self._ports[name].Eval(context)
-        pose = self._at(context)
-        v, w = context.get_discrete_state(int(self._pose)).value()[4:]
-        q_d[self._base] = pose
-        v_d[self._base] = [v * np.cos(pose[2]), v * np.sin(pose[2]), w]
+        x, y, h, v, w = self._now(context)
         state = self._state.Eval(context)
-        for side in SIDES:
-            q = state[self._finger_q[side]]
-            wanted = self._ports[f"{side}_gripper.position_command"].Eval(context)[0] / 2
-            reach = self._ports[f"{side}_gripper.force_limit"].Eval(context)[0] / FINGER_STIFFNESS
-            q_d[self._finger[side]] = q + np.clip(wanted - q, -reach, reach)
-        output.SetFromVector(np.concatenate([q_d, v_d]))
+        fingers = []
+        for k, slot in enumerate(self._fingers):
+            q = state[slot]
+            reach = self._limit[k].Eval(context)[0] / FINGER_STIFFNESS
+            fingers.append(q + min(max(self._opening[k].Eval(context)[0] / 2 - q, -reach), reach))
+        output.SetFromVector([x, y, h, *fingers, v * math.cos(h), v * math.sin(h), w, 0.0, 0.0])
+
+
+def _add_servos(builder: DiagramBuilder, plant: MultibodyPlant, scene: Scene, start: np.ndarray) -> ServoDriver:
+    """From the contract's commands to [q_d; v_d] of all actuators. Arms and torso get v_d = 0: they are sent positions.
+
+    All but the base and the fingers is C++, as it runs at every step of the plant.
+    """
+    actuated = [plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices(scene.robot)]
+    n = len(actuated)
+    fingers = [f"{side}_finger_1" for side in SIDES]
+    driver = builder.AddSystem(
+        ServoDriver(
+            [plant.GetJointByName(f, scene.robot).position_start() for f in fingers], plant.num_multibody_states(), start
+        )
+    )
+    arms = {f"{side}_arm.position_command": arm_joints(side) for side in SIDES}
+    parts = {"torso.position_command": list(TORSO), **arms}
+    joints = [joint for names in parts.values() for joint in names]
+    every = Multiplexer([*(len(names) for names in parts.values()), 10])
+    every.set_name("servo_targets")
+    builder.AddSystem(every)
+    order = np.zeros((2 * n, every.get_output_port().size()))
+    for k, joint in enumerate(joints):
+        order[actuated.index(joint), k] = 1
+    for k, joint in enumerate([*BASE, *fingers]):
+        order[actuated.index(joint), len(joints) + k] = 1
+        order[n + actuated.index(joint), len(joints) + 5 + k] = 1
+    sort = builder.AddSystem(MatrixGain(order))
+    sort.set_name("servo_order")
+    for k, port in enumerate(parts):
+        builder.ExportInput(every.get_input_port(k), port)
+    builder.Connect(driver.get_output_port(), every.get_input_port(len(parts)))
+    builder.Connect(every.get_output_port(), sort.get_input_port())
+    for spec in CONTRACT:
+        if spec.direction == "in" and spec.name not in parts:
+            builder.ExportInput(driver.GetInputPort(spec.name), spec.name)
+    builder.Connect(plant.get_state_output_port(), driver.GetInputPort("plant_state"))
+    builder.Connect(sort.get_output_port(), plant.get_desired_state_input_port(scene.robot))
+    return driver
 
 
 def _rng(seed: int, stream: int, count: int) -> np.random.Generator:
@@ -307,11 +331,7 @@ def make_simulated_station(
     _set_start(plant, scene, simulation, start, home, opening)
     joints = Joints(plant, scene)
 
-    driver = builder.AddSystem(ServoDriver(plant, scene, start))
-    for name, spec in {s.name: s for s in CONTRACT if s.direction == "in"}.items():
-        builder.ExportInput(driver.GetInputPort(spec.name), name)
-    builder.Connect(plant.get_state_output_port(), driver.GetInputPort("plant_state"))
-    builder.Connect(driver.GetOutputPort("desired_state"), plant.get_desired_state_input_port(scene.robot))
+    driver = _add_servos(builder, plant, scene, start)
     still = builder.AddSystem(ConstantVectorSource(np.zeros(2)))
     still.set_name("valve_at_rest")
     builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(scene.valve))

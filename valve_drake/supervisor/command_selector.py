@@ -1,9 +1,9 @@
-"""The only writer to the robot: one command per tick, taken from the block that owns each group in this mode, and bounded.
+"""The only writer to the robot: one command per tick, taken from the block that owns each group in this mode.
 
-SOURCE says who commands which group in which mode. A group without an owner holds: the base brakes to zero twist, joints
-brake and stay. So does a group whose command is missing, older than `max_age`, not finite or otherwise wrong,
-and every group while the robot's state or the mode is that old. An emergency stop holds everything but the grippers, so
-that a hand can always be opened. In failed and stopped the hands open, whatever happened before.
+SOURCE says who commands which group in which mode. A group without an owner holds: the base brakes to zero twist,
+joints brake and stay. So does a group whose command is missing, older than `max_age`, not finite or otherwise wrong,
+and every group while the robot's state or the mode is that old. An emergency stop holds everything but the grippers,
+so that a hand can always be opened. In failed and stopped the hands open, whatever happened before.
 
 Position, speed and acceleration are bounded by motion.follow: within the bounds a command passes unchanged.
 The first command of each joint is its measured position.
@@ -305,7 +305,6 @@ def _joints(
     stay = np.clip(m.position + braked * dt, np.minimum(b.low, m.position), np.maximum(b.high, m.position))
     position = np.where(held, stay, position)
     velocity = np.where(held, (stay - m.position) / dt, velocity)
-    target = np.where(held, position, target)
     changed = []
     for group in wanted:
         part = JOINTS.get(group)

@@ -9,16 +9,16 @@ One block owns each mode: its Status, carrying this activation's number, ends it
     measure: the stance does not serve          -> fine_approach again
     servo failed                                -> reach again
     grasp missed                                -> release -> reach again
-    any other failure or a missed deadline      -> the run will fail with this verdict, and the robot gets off the valve first:
+    any other failure or a missed deadline      -> the run will fail with this verdict, off the valve first:
         hands at the handles (servo, grasp, turn)  -> release -> verify -> retreat -> failed
         hands near them (reach)                    -> verify (folds the arms) -> retreat -> failed
         elsewhere                                  -> failed
     fault or operator's stop                    -> hands at the handles: release, then failed or stopped;
                                                    elsewhere at once, the robot held still
 
-Retries are counted over the run and bounded, and every mode has a deadline, so a run always ends. `verify` decides `turned` by
-camera, even if the turn itself had ended with another verdict; otherwise the first verdict stays. A release that fails
-ends the run at once: command_selector opens the hands in failed and stopped.
+Retries are counted over the run and bounded, and every mode has a deadline, so a run always ends. `verify` decides
+`turned` by camera, even if the turn itself had ended with another verdict; otherwise the first verdict stays. A release
+that fails ends the run at once: command_selector opens the hands in failed and stopped.
 """
 
 import dataclasses as dc

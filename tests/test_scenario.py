@@ -1,0 +1,92 @@
+"""scenario.py: what a user may write, and the one line for what may not be."""
+
+import numpy as np
+import pytest
+
+from valve_drake import scenario as mut
+from valve_drake.checks import ConfigError
+from valve_drake.stations.simulation_config import Uniform
+
+
+def test_shipped_scenario_loads_and_round_trips():
+    loaded = mut.load()
+    again = mut._apply(mut.Scenario(), mut.dump(loaded), "dump")
+    assert mut.dump(again) == mut.dump(loaded)
+    assert isinstance(loaded.simulation.valve.height, Uniform)
+
+
+def test_resolve_draws_every_distribution_inside_its_range_and_depends_on_the_seed_alone():
+    heights = set()
+    for seed in range(20):
+        resolved = mut.resolve(mut.load(None, [f"seed={seed}"]))
+        again = mut.resolve(mut.load(None, [f"seed={seed}"]))
+        assert mut.dump(resolved) == mut.dump(again)
+        assert "!Uniform" not in mut.dump(resolved)
+        assert 0.81 <= resolved.simulation.valve.height <= 1.22
+        heights.add(resolved.simulation.valve.height)
+    assert len(heights) == 20
+
+
+def test_a_fixed_number_changes_no_other_draw():
+    free = mut.resolve(mut.load(None, ["seed=3"])).simulation
+    fixed = mut.resolve(mut.load(None, ["seed=3", "simulation.valve.height=1.0"])).simulation
+    assert fixed.valve.height == 1.0
+    assert fixed.valve.friction == free.valve.friction and fixed.start.bearing == free.start.bearing
+
+
+def test_close_starts_open_and_an_explicit_position_stays():
+    assert mut.resolve(mut.load(None, ["command=close"])).simulation.valve.position == pytest.approx(np.pi / 2, abs=1e-4)
+    assert mut.resolve(mut.load(None, [])).simulation.valve.position == 0.0
+    given = ["command=close", "simulation.valve.position=0.7"]
+    assert mut.resolve(mut.load(None, given)).simulation.valve.position == 0.7
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("simulation.valve.heigth=1", ["unknown key simulation.valve.heigth", "height"]),
+        ("simulation.valve.height=abc", ["simulation.valve.height", "number", "abc"]),
+        ("simulation.valve.height=9", ["simulation.valve.height", "within", "9"]),
+        ("simulation.valve.height=.nan", ["simulation.valve.height", "finite", "nan"]),
+        ("simulation.valve.height=!Gaussian {mean: 1}", ["!Gaussian", "!Uniform"]),
+        ("simulation.valve.height=!Uniform {min: 1.2, max: 0.9}", ["simulation.valve.height", "min <= max"]),
+        ("marker.size=[0.2, 0.1]", ["marker.size", "panel", "0.2"]),
+        ("marker.size=[0.1]", ["marker.size", "two lengths"]),
+        ("marker.size=0.1", ["marker.size", "list"]),
+        ("marker=3", ["marker", "group of keys"]),
+        ("command=push", ["command", "open or close", "push"]),
+        ("seed=1.5", ["seed", "whole number", "1.5"]),
+        ("seed=-1", ["seed", "-1"]),
+        ("station=mars", ["station", "mars"]),
+        ("hybrid_rotation.torque_limit=99", ["hybrid_rotation.torque_limit", "99"]),
+        ("supervisor.deadline.search=-1", ["supervisor.deadline.search", "-1"]),
+        ("simulation.camera.head_period=0.1", ["head_period", "1/128", "0.1"]),
+        ("nonsense", ["key=value"]),
+    ],
+)
+def test_bad_values_give_one_line_that_names_key_rule_and_value(override, words):
+    with pytest.raises(ConfigError) as caught:
+        mut.load(None, [override])
+    text = str(caught.value)
+    assert "\n" not in text
+    for word in words:
+        assert word in text
+
+
+def test_a_missing_file_and_one_that_is_not_yaml(tmp_path):
+    with pytest.raises(ConfigError, match="no such file: nowhere.yaml"):
+        mut.load("nowhere.yaml")
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("a: [1\nb: 2")
+    with pytest.raises(ConfigError, match="bad.yaml: not YAML"):
+        mut.load(str(bad))
+    empty = tmp_path / "empty.yaml"
+    empty.write_text("")
+    assert mut.dump(mut.load(str(empty))) == mut.dump(mut.Scenario())
+
+
+def test_loading_twice_shares_nothing():
+    a, b = mut.load(), mut.load()
+    a.marker.size[0] = 0.05
+    a.supervisor.deadline["search"] = 1.0
+    assert b.marker.size[0] == 0.098 and b.supervisor.deadline["search"] == 60.0

@@ -1,0 +1,217 @@
+"""stations: the contract, and the simulated station that keeps it."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from valve_drake import scenario as scenarios
+from valve_drake.diagram import initial_commands, make_station
+from valve_drake.frames import apply, compose, inverse, make, planar
+from valve_drake.kinematics import GEOMETRY
+from valve_drake.messages import SIDES
+from valve_drake.stations import contract, simulated
+from valve_drake.stations.scene import panel_pose, start_pose
+from valve_drake.stations.simulation_config import ErrorConfig, StartConfig, ValveConfig
+
+PERFECT = [
+    f"simulation.error.{name}=0"
+    for name in ("head_yaw", "head_rotation", "head_mount", "odometry_scale", "odometry_noise")
+] + [f"simulation.error.wrench_{kind}=0" for kind in ("noise_force", "noise_torque", "bias_force", "bias_torque")]
+NEAR = [
+    "simulation.start.distance=0.9",
+    "simulation.start.bearing=0",
+    "simulation.start.heading=0",
+    "simulation.valve.height=1.0",
+    "simulation.valve.yaw=0",
+    "simulation.valve.tilt=0",
+    "simulation.valve.bar_angle=0",
+    "simulation.valve.friction=5.1",
+    "simulation.light.red_gain=1",
+    "simulation.light.blue_gain=1",
+    "simulation.camera.noise=0",
+    "simulation.camera.blur=0",
+]
+
+
+class Rig:
+    """The simulated station alone, its inputs held by hand."""
+
+    def __init__(self, overrides=(), **commands):
+        self.scenario = scenarios.resolve(scenarios.load(None, [*PERFECT, *NEAR, *overrides]))
+        self.station = make_station(self.scenario)
+        self.simulator = Simulator(self.station)
+        self.context = self.simulator.get_mutable_context()
+        for name, value in (initial_commands(self.scenario) | commands).items():
+            self.station.GetInputPort(name).FixValue(self.context, value)
+        self.simulator.Initialize()
+
+    def set(self, name, value):
+        self.station.GetInputPort(name).FixValue(self.context, value)
+
+    def read(self, name):
+        return self.station.GetOutputPort(name).Eval(self.context)
+
+    def run(self, time):
+        self.simulator.AdvanceTo(time)
+        return self
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return Rig().run(0.5)
+
+
+def test_the_simulated_station_exports_exactly_the_contract(rig):
+    contract.check_contract(rig.station)
+    extra = set(contract.ports_of(rig.station)) - {spec.name for spec in contract.CONTRACT}
+    assert extra == {f"truth.{name}" for name in simulated.TruthSystem.OUTPUTS}
+
+
+def test_check_contract_names_what_is_missing_extra_and_different():
+    builder = DiagramBuilder()
+    source = builder.AddSystem(ConstantVectorSource(np.zeros(4)))
+    builder.ExportOutput(source.get_output_port(), "base.odometry")
+    other = builder.AddSystem(ConstantVectorSource(np.zeros(4)))
+    builder.ExportOutput(other.get_output_port(), "base.mood")
+    diagram = builder.Build()
+    diagram.set_name("wrong")
+    with pytest.raises(TypeError) as caught:
+        contract.check_contract(diagram)
+    for words in ("missing health", "extra base.mood", "base.odometry is ('out', 4), not ('out', 5)"):
+        assert words in str(caught.value)
+
+
+def test_the_robot_stands_still_at_home(rig):
+    for k, side in enumerate(SIDES):
+        home = initial_commands(rig.scenario)[f"{side}_arm.position_command"]
+        np.testing.assert_allclose(rig.read(f"{side}_arm.position_measured"), home, atol=2e-4)
+        assert np.abs(rig.read(f"{side}_arm.velocity_measured")).max() < 1e-3
+        assert rig.read(f"{side}_gripper.position_measured")[0] == pytest.approx(0.085, abs=1e-4)
+    np.testing.assert_allclose(rig.read("base.odometry"), 0, atol=1e-4)
+
+
+def test_a_wrist_sensor_feels_the_hands_weight_downwards(rig):
+    for side in SIDES:
+        R_HG = GEOMETRY.arm_forward(rig.read(f"{side}_arm.position_measured"), side)[:, :3]
+        force = R_HG @ rig.read(f"{side}_wrist.wrench")[3:]
+        np.testing.assert_allclose(force, [0, 0, -9.81 * GEOMETRY.hand_mass], atol=0.05)
+
+
+def test_arms_follow_positions_and_report_torque():
+    rig = Rig().run(0.1)
+    goal = initial_commands(rig.scenario)["left_arm.position_command"] + np.array([-0.1, 0, 0, 0, 0, 0])
+    rig.set("left_arm.position_command", goal)
+    rig.run(0.8)
+    np.testing.assert_allclose(rig.read("left_arm.position_measured"), goal, atol=1e-3)
+    assert 3 < abs(rig.read("left_arm.torque_measured")[0]) < 40  # carries the arm
+
+
+def test_the_base_drives_like_a_differential_drive_and_odometry_agrees_without_errors():
+    rig = Rig(["simulation.start.distance=3"], **{"base.twist_command": np.array([0.2, 0.5])}).run(1.0)
+    x, y, heading, forward, rate = rig.read("base.odometry")
+    assert heading == pytest.approx(0.5, abs=0.02) and rate == pytest.approx(0.5, abs=0.01)
+    assert forward == pytest.approx(0.2, abs=0.01)
+    assert np.hypot(x, y) == pytest.approx(2 * 0.2 / 0.5 * np.sin(0.25), abs=0.01)  # chord of the arc
+    true = rig.read("truth.base_pose")
+    np.testing.assert_allclose(true, [-3 + x, y, heading], atol=6e-3)  # truth is one tick older
+
+
+def test_odometry_drifts_with_errors():
+    drift = ["simulation.error.odometry_scale=0.05", "simulation.start.distance=3", "seed=2"]
+    rig = Rig(drift, **{"base.twist_command": np.array([0.3, 0.0])}).run(1.0)
+    moved = rig.read("truth.base_pose")[0] + 3
+    assert abs(rig.read("base.odometry")[0] - moved) > 1e-3
+
+
+def test_the_gripper_keeps_its_force_limit_on_the_hand_itself():
+    rig = Rig(
+        **{"left_gripper.position_command": np.array([0.0]), "left_gripper.force_limit": np.array([30.0])}
+    ).run(1.0)
+    assert rig.read("left_gripper.position_measured")[0] < 0.002
+    assert rig.read("left_gripper.force_measured")[0] <= 30.5
+
+
+def test_the_valve_does_not_move_by_itself_and_truth_has_its_pose(rig):
+    angle, rate = rig.read("truth.valve_angle")
+    assert abs(angle) < 1e-6 and abs(rate) < 1e-6
+    X_WV = rig.read("truth.marker_pose").reshape(3, 4)
+    np.testing.assert_allclose(X_WV, [[0, 0, 1, -0.131], [-1, 0, 0, 0], [0, -1, 0, 1.0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", ["head_left", "head_right"])
+def test_a_rendered_marker_lies_where_the_lens_says_to_a_twentieth_of_a_pixel(camera):
+    """Half-pixel conventions of renderer, lens and OpenCV, the camera's mounting and eq. (1), all at once."""
+    from valve_drake.camera.lens import load_head
+    from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
+    from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads
+    from valve_drake.resources import models
+
+    rig = Rig(
+        [  # a little optical blur, as any camera has: without it an edge along a pixel row has no sub-pixel place
+            "simulation.camera.supersample=4",
+            "simulation.camera.blur=0.6",
+            "simulation.camera.jpeg_quality=100",
+            "simulation.start.distance=1.3",
+        ],
+        **{"torso.position_command": np.array([0.0, 0.32, 0.0])},
+    ).run(0.6)
+    head = load_head(models() / "calibration" / "head.yaml")
+    frame = rig.read(f"{camera}.image")
+    side = camera.removeprefix("head_")
+    candidates, _ = segment(frame.image, ColorSegmentationConfig())
+    quad = fit_quads([frame.image], [candidates[0].corners], LineFittingConfig())[0]
+    base = rig.read("truth.base_pose")
+    X_WL = compose(planar(*base), GEOMETRY.X_BL(rig.read("torso.position_measured")))
+    X_WC = X_WL if side == "left" else compose(X_WL, head.X_LR)
+    X_CV = compose(inverse(X_WC), rig.read("truth.marker_pose").reshape(3, 4))
+    lens = getattr(head, side)
+    w, h = rig.scenario.marker.size
+    corners = apply(X_CV, np.array([[-w, -h, 0], [w, -h, 0], [w, h, 0], [-w, h, 0]]) / 2)
+    px = lens.project(corners[:, :2] / corners[:, 2:])
+    ends = np.roll(px, -1, axis=0)
+    normal = np.stack([-(ends - px)[:, 1], (ends - px)[:, 0]], -1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    for k in range(4):  # the true side nearest to each fitted one
+        points = quad.points[quad.side == k]
+        off = np.abs(((points[:, None] - px) * normal).sum(-1)).mean(0).min()
+        signed = min((((points[:, None] - px) * normal).sum(-1).mean(0)), key=abs)
+        assert abs(signed) < 0.05, (k, off)
+
+
+def test_a_camera_that_nobody_reads_is_not_rendered_and_a_late_reader_sees_the_capture(monkeypatch):
+    count = []
+    real = simulated.CameraRig.frame
+    monkeypatch.setattr(simulated.CameraRig, "frame", lambda *a: (count.append(a[1]), real(*a))[1])
+    rig = Rig().run(0.3)
+    assert count == []
+    frame = rig.read("head_left.image")
+    assert frame.time == 0.25 and frame.sequence == 2 and frame.image.shape == (480, 640, 3)
+    assert rig.read("head_left.image") is frame and count == ["head_left"]
+
+
+def test_same_seed_same_image_other_seed_other_noise():
+    noisy = ["simulation.camera.noise=2"]
+    a, b, c = (Rig([*noisy, f"seed={s}"]).run(0.01).read("head_left.image") for s in (1, 1, 2))
+    assert a.data == b.data != c.data
+
+
+def test_start_pose_puts_the_robot_at_its_distance_bearing_and_heading():
+    valve = ValveConfig(height=1.0, yaw=0.4)
+    x, y, heading = start_pose(StartConfig(distance=3.0, bearing=0.5, heading=0.2), valve)
+    assert np.hypot(x, y) == pytest.approx(3.0)
+    normal = -panel_pose(valve)[:2, 2]  # out of the panel
+    assert np.arccos(normal @ np.array([x, y]) / 3.0) == pytest.approx(0.5)
+    assert heading - np.arctan2(-y, -x) == pytest.approx(0.2)
+
+
+def test_true_head_is_the_calibration_when_there_are_no_errors():
+    from valve_drake.camera.lens import load_head
+    from valve_drake.resources import models
+
+    head = load_head(models() / "calibration" / "head.yaml")
+    zero = ErrorConfig(**{name: 0.0 for name in vars(ErrorConfig())})
+    mounts = simulated.true_head(head, zero, 1)
+    np.testing.assert_array_equal(mounts["head_left"].X_FC, make(np.eye(3), np.zeros(3)))
+    np.testing.assert_allclose(mounts["head_right"].X_FC, head.X_LR)

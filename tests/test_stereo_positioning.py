@@ -1,0 +1,187 @@
+"""Which red area is the marker, and where it is."""
+
+import dataclasses as dc
+import pathlib
+
+import numpy as np
+import pytest
+from drawn_scene import RED, Drawing, draw_valve, facing
+from helpers import Rig, ports, same
+
+from valve_drake import frames
+from valve_drake.camera.lens import load_head
+from valve_drake.checks import ConfigError
+from valve_drake.messages import CameraFrame, MarkerCandidate, RobotState, Segmentation, SegmentationPair
+from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
+from valve_drake.perception.marker import Marker
+from valve_drake.perception.stereo_positioning import (
+    Match,
+    StereoPositioningConfig,
+    locate,
+    match,
+    single,
+    triangulate,
+)
+from valve_drake.perception.stereo_positioning_system import StereoPositioningSystem
+
+HEAD = load_head(pathlib.Path(__file__).parents[1] / "models" / "calibration" / "head.yaml")
+MARKER, CONFIG = Marker(), StereoPositioningConfig()
+VIEWS = ((HEAD.left, np.eye(3, 4)), (HEAD.right, frames.inverse(HEAD.X_LR)))
+
+
+def seen(p_L):
+    """Raw px of a point in both cameras."""
+    P = [frames.apply(X, p_L) for _, X in VIEWS]
+    return [lens.project(q[:2] / q[2]) for (lens, _), q in zip(VIEWS, P)]
+
+
+def candidates_of(*things):
+    """The ideal candidates of rectangles (X_LV, width, height) in both images."""
+    both = []
+    for lens, X_CL in VIEWS:
+        one = []
+        for X, width, height in things:
+            P = frames.apply(frames.compose(X_CL, X), Marker(size=[width, height]).corners())
+            px = lens.project(P[:, :2] / P[:, 2:])
+            x, y = px[:, 0], px[:, 1]
+            area = abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+            one.append(MarkerCandidate(corners=px, center=px.mean(0), area=area, score=1.0))
+        both.append(tuple(one))
+    return both
+
+
+@pytest.mark.parametrize("p", [[0.0, 0.0, 0.5], [0.3, -0.2, 2.0], [-0.5, 0.5, 5.0]])
+def test_triangulation_is_exact_without_noise(p):
+    found, _, off = triangulate(*seen(np.array(p)), HEAD, 0.3)
+    np.testing.assert_allclose(found, p, atol=1e-9)
+    assert off < 1e-7
+
+
+def test_covariance_is_that_of_noisy_pixels():
+    rng = np.random.default_rng(0)
+    p = np.array([0.2, -0.1, 2.0])
+    left, right = seen(p)
+    errors = np.array(
+        [triangulate(left + rng.normal(0, 0.4, 2), right + rng.normal(0, 0.4, 2), HEAD, 0.4)[0] - p for _ in range(400)]
+    )
+    C = triangulate(left, right, HEAD, 0.4)[1]
+    nees = np.einsum("ki,ij,kj->k", errors, np.linalg.inv(C), errors) / 3
+    assert 0.85 < nees.mean() < 1.15
+
+
+def test_yaw_error_of_the_head_is_in_the_covariance():
+    p, yaw = np.array([0.0, 0.0, 2.0]), 0.001
+    wrong = dc.replace(HEAD, X_LR=frames.compose(HEAD.X_LR, frames.make(frames.rot_y(yaw), np.zeros(3))))
+    moved = triangulate(*seen(p), wrong, 1e-4)[0] - p
+    C = triangulate(*seen(p), HEAD, 1e-4, yaw_sigma=yaw)[1]
+    np.testing.assert_allclose(np.sqrt(C[2, 2]), abs(moved[2]), rtol=0.05)
+
+
+def test_rays_that_do_not_meet_give_nan_not_an_error():
+    p, C, _ = triangulate(np.array([100.0, 200.0]), np.array([600.0, 250.0]), HEAD, 0.3)
+    assert np.isnan(p).all() and np.isinf(C).all()
+
+
+def test_marker_is_chosen_among_red_rectangles_of_other_sizes():
+    things = [
+        (facing(2.0, 0.4, x=-0.3), 0.2, 0.2),
+        (facing(2.0, 0.2, 0.3, 0.4, x=0.1), 0.098, 0.100),
+        (facing(3.0, x=0.3, y=-0.2), 0.05, 0.06),
+        (facing(4.0, x=-0.6, y=0.3), 0.3, 0.3),
+    ]
+    left, right = candidates_of(*things)
+    assert match(left, right, HEAD, MARKER, CONFIG) == Match(left=1, right=1)
+    assert match(left[::-1], right, HEAD, MARKER, CONFIG) == Match(left=2, right=1)
+
+
+@pytest.mark.parametrize(
+    ("things", "says"),
+    [
+        ([(facing(2.0), 0.2, 0.2)], "size"),
+        ([(facing(2.0), 0.098, 0.300)], "size"),
+        ([(facing(9.0), 0.098, 0.100)], "distance"),
+    ],
+)
+def test_no_pair_has_a_reason(things, says):
+    assert says in match(*candidates_of(*things), HEAD, MARKER, CONFIG).reason
+
+
+def test_quadrilateral_that_no_rectangle_projects_to_is_no_marker():
+    left, right = (
+        tuple(dc.replace(c, corners=c.corners + [[20, 0], [0, 0], [0, 0], [0, -20]]) for c in one)
+        for one in candidates_of((facing(2.0), 0.098, 0.100))
+    )
+    assert "shape" in match(left, right, HEAD, MARKER, CONFIG).reason
+
+
+def test_candidates_on_different_rows_are_no_pair():
+    left, right = candidates_of((facing(2.0), 0.098, 0.100))
+    right = (dc.replace(right[0], center=right[0].center + [0, 12], corners=right[0].corners + [0, 12]),)
+    assert "epipolar" in match(left, right, HEAD, MARKER, CONFIG).reason
+
+
+def test_rejected_candidates_take_no_part():
+    left, right = candidates_of((facing(2.0), 0.098, 0.100))
+    left = (dc.replace(left[0], rejected="fill: 0.5"),)
+    assert match(left, right, HEAD, MARKER, CONFIG).reason == "no candidate in the left image"
+    assert single(left, HEAD.left, MARKER, CONFIG) == -1
+    assert single(right, HEAD.right, MARKER, CONFIG) == 0
+
+
+def test_two_to_one_marker_is_matched_whichever_way_it_hangs():
+    marker = Marker(size=[0.12, 0.06])
+    for roll in (0.0, 0.8, 1.57, 3.0):
+        pair = candidates_of((facing(2.0, 0.5, 0.3, roll), 0.12, 0.06))
+        assert match(*pair, HEAD, marker, CONFIG).reason == ""
+
+
+def drawn_pair(X_LV, rng, sequence=0):
+    both = []
+    for lens, X_CL in VIEWS:
+        drawing = Drawing(lens)
+        for x, half in ((-0.45, (0.12, 0.10)), (0.45, (0.03, 0.035))):  # red boxes of other sizes
+            drawing.shape(frames.compose(X_CL, facing(X_LV[2, 3] + 0.3, 0.3, 0.0, 0.1, x)), RED, half)
+        draw_valve(drawing, frames.compose(X_CL, X_LV), MARKER)
+        image = drawing.finish(rng)
+        candidates, green = segment(image, ColorSegmentationConfig())
+        both.append(Segmentation(frame=CameraFrame(image=image), candidates=candidates, green=green))
+    return SegmentationPair(time=sequence / 8, sequence=sequence, left=both[0], right=both[1])
+
+
+@pytest.mark.parametrize("z", [1.5, 2.5, 4.0])
+def test_drawn_marker_among_distractors_is_located_to_a_percent(z):
+    X = facing(z, 0.3, 0.2, 0.4, 0.05, 0.05)
+    found = locate(drawn_pair(X, np.random.default_rng(0)), HEAD, MARKER, CONFIG, np.eye(3, 4))
+    assert found.found, found.reason
+    assert np.linalg.norm(found.p_LV - X[:, 3]) < 0.012 * z
+    error = found.p_LV - X[:, 3]
+    assert error @ np.linalg.solve(found.covariance, error) < 20
+
+
+def test_block():
+    def head_pose(odometry, torso):
+        return frames.planar(*odometry)
+
+    block = StereoPositioningSystem(CONFIG, HEAD, head_pose)
+    assert ports(block) == {"segmentation": "in abstract", "robot_state": "in abstract", "position": "out abstract"}
+    X = facing(2.0, 0.2, 0.1)
+    pair = drawn_pair(X, np.random.default_rng(0), 8)
+    history = np.array([[0.5, 0, 0, 0, 0, 0, 0], [1.5, 2, 0, 1, 0, 0, 0]], float)
+    dut = Rig(block, segmentation=pair, robot_state=RobotState(history=history))
+    first = dut.run(0.1).read("position")
+    assert first.found and first.sequence == 8
+    np.testing.assert_allclose(first.X_OL, frames.planar(1.0, 0.0, 0.5))  # where the head was at capture, t = 1.0
+    assert dut.run(0.4).read("position") is first
+    clone = dut.context.Clone()
+    dut.fix(segmentation=SegmentationPair(sequence=9, time=1.1))
+    lost = dut.run(0.6).read("position")
+    assert not lost.found and lost.reason and dut.read("position", clone).found
+    fresh = Rig(StereoPositioningSystem(CONFIG, HEAD, head_pose), segmentation=pair)
+    fresh.fix(robot_state=RobotState(history=history))
+    assert same(fresh.run(0.1).read("position"), first)
+
+
+@pytest.mark.parametrize("bad", [{"center_sigma": 0.0}, {"max_distance": 0.1}, {"yaw_sigma": -0.1}])
+def test_bad_config_is_refused(bad):
+    with pytest.raises(ConfigError, match=f"stereo_positioning.{next(iter(bad))}"):
+        dc.replace(CONFIG, **bad).check()
