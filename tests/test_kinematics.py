@@ -164,18 +164,15 @@ def test_at_zero_the_arms_point_forward():
 
 
 def test_inverse_of_forward_is_the_same_arm():
+    checked = 0
     for side, q in random_arms(7, 300):
         q = elbow_out(side, q)
+        if GEOMETRY.upper_arm * np.cos(q[1]) + GEOMETRY.forearm * np.cos(q[1] + q[2]) < 0:
+            continue  # folded over the axis of J1: the inverse takes J1 half a turn on instead
+        checked += 1
         solution = GEOMETRY.arm_inverse(GEOMETRY.arm_forward(q, side), side, q)
-        wrist = q.copy()  # what reaches behind the shoulder folds over: J1 on the other side of the same plane
-        assert solution is not None or behind(side, q), (side, q)
-        if solution is not None and not behind(side, q):
-            assert solution == pytest.approx(wrist, abs=1e-7)
-
-
-def behind(side: str, q: np.ndarray) -> bool:
-    """The wrist's centre is on the far side of the shoulder's axis: not a pose that the inverse gives back."""
-    return GEOMETRY.upper_arm * np.cos(q[1]) + GEOMETRY.forearm * np.cos(q[1] + q[2]) < 0
+        assert solution == pytest.approx(q, abs=1e-7)
+    assert checked > 100
 
 
 def test_whatever_the_inverse_gives_reaches_the_pose_within_the_limits():
@@ -196,17 +193,20 @@ def test_whatever_the_inverse_gives_reaches_the_pose_within_the_limits():
 
 
 def test_the_inverse_stays_on_its_branch_along_a_motion():
-    """Both wrist branches, J4 and J6 beyond half a turn: small steps of the hand are small steps of the joints."""
+    """Both wrist branches, J4 through half a turn: small steps of the hand are small steps of the joints."""
+    through = 0
     for side in SIDES:
-        for wrist in ((0.3, 1.2, -0.4), (0.3, -1.2, -0.4), (3.2, 1.0, 0.0), (-3.2, 1.0, 3.0)):
+        for wrist in ((0.3, 1.2, -0.4), (0.3, -1.2, -0.4), (3.13, 1.0, 0.0), (3.15, 1.0, 0.0), (-3.15, 1.0, 2.8)):
             q = HOME if side == LEFT else HOME * MIRROR
             q = np.concatenate([q[:3], wrist])
             X = GEOMETRY.arm_forward(q, side)
-            for k in range(200):
+            for k in range(40):
                 X = make(rotation(np.array([0.001, 0.002, -0.001])) @ X[:, :3], X[:, 3] + [0.0003, 0.0001, -0.0002])
                 near = q
                 q = GEOMETRY.arm_inverse(X, side, near)
                 assert q is not None and np.max(np.abs(q - near)) < 0.02, (side, wrist, k)
+            through += (abs(q[3]) - np.pi) * (abs(wrist[0]) - np.pi) < 0
+    assert through >= 2
 
 
 def test_a_straight_wrist_keeps_its_roll():

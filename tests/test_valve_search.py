@@ -217,7 +217,7 @@ def test_nothing_is_commanded_before_the_robot_was_measured():
 def test_aim_puts_a_point_on_the_optical_axis(waist, point):
     base, p_OV = np.array([0.1, -0.2, 0.3]), np.array(point)
     neck = np.zeros(2)
-    for _ in range(4):  # ticks
+    for _ in range(8):  # ticks
         neck = aim(HEAD, base, np.array([waist, *neck]), p_OV)
     x, y, z = apply(inverse(HEAD(base, np.array([waist, *neck]))), p_OV)
     assert z > 0 and np.hypot(x, y) / z < 1e-4

@@ -30,7 +30,7 @@ from valve_drake.recording.writer import LogError, LogWriter
 from valve_drake.scenario import Scenario, dump, resolve
 
 STEP = 1 / 32  # between two looks at the mode [s]
-TAIL = 0.5  # recorded after the end [s]
+TAIL = 1.5  # recorded after the end: a stopped base takes a second to stand [s]
 TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
 
 

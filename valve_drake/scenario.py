@@ -72,12 +72,12 @@ class Scenario:
         require(self.command in ("open", "close"), "command", "open or close", self.command)
         require_in(self.angle, 0.01, 6.29, "angle")
         require_in(self.time_limit, 0.1, 3600.0, "time_limit")
+        for length in self.marker.size:
+            require(length <= PLATE, "marker.size", f"not larger than the panel's face of {PLATE} m", self.marker.size)
         for field in dc.fields(self):
             value = getattr(self, field.name)
             if dc.is_dataclass(value):
                 value.check()
-        for length in self.marker.size:
-            require(length <= PLATE, "marker.size", f"not larger than the panel's face of {PLATE} m", self.marker.size)
 
 
 def load(path: str | None = None, overrides: typing.Sequence[str] = ()) -> Scenario:

@@ -214,8 +214,8 @@ class HybridRotation:
         q = (state.left_arm, state.right_arm)
         X = tuple(self.geometry.arm_forward(q[k], side) for k, side in enumerate(SIDES))
         m = self._sense(dt, memory, state, mode, X)
-        if mode.mode in (Mode.REACH, Mode.SERVO):
-            return dc.replace(m, activation=-1, status=Status()), Command(time=time)
+        if mode.mode in (Mode.REACH, Mode.SERVO):  # others move the hands: what was commanded before is void
+            return dc.replace(m, activation=-1, status=Status(), X=None), Command(time=time)
         p = np.array([X[0][:, 3], X[1][:, 3]])
         u = -plan.X_BV[:, 2]  # H and B have the same axes while the waist is at zero
         chain = make_chain(p, m.wrenches, u)

@@ -38,12 +38,12 @@ class Path:
 
     def sample(self, time: float) -> np.ndarray:
         """Joint angles at `time` -> (12,)."""
-        left = time - self.start
+        left = max(time - self.start, 0.0)  # a leg without length is over before it begins
         for k, duration in enumerate(self.durations()):
             if left < duration:
                 a, b = self.points[k], self.points[k + 1]
                 reach = float(np.max(np.abs(b - a)))
-                return a + (b - a) * (_trapezoid(max(left, 0.0), duration, reach, self.acceleration) / reach)
+                return a + (b - a) * (_trapezoid(left, duration, reach, self.acceleration) / reach)
             left -= duration
         return self.points[-1]
 

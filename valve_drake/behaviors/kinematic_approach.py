@@ -154,7 +154,8 @@ class KinematicApproach:
                 m = self._watch_stance(time, m, mode, estimate)
             elif mode.mode == Mode.SEARCH:
                 m = dc.replace(m, stance=Stance(), stance_looks=())
-            m = self._homing(time, m, None)
+            near = mode.mode == Mode.RETREAT and m.plan.found  # the base has not left the valve yet
+            m = self._homing(time, m, turned(m.plan.X_BV, turn.angle) if near else None)
         if m.path is not None:
             m = dc.replace(m, q=m.path.sample(time))
         gripper = np.array([self.config.opening, self.config.gripper_force])

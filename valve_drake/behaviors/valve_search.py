@@ -100,22 +100,18 @@ class Memory:
     ignore_until: float = -np.inf  # capture time [s]
 
 
-def aim(
-    head_pose: HeadPose, base: np.ndarray, torso: np.ndarray, p_OV: np.ndarray, iterations: int = 2
-) -> np.ndarray:
-    """Neck pitch and yaw that bring p_OV onto the left camera's optical axis -> (2,).
+def aim(head_pose: HeadPose, base: np.ndarray, torso: np.ndarray, p_OV: np.ndarray) -> np.ndarray:
+    """Neck pitch and yaw that bring p_OV nearer to the left camera's optical axis -> (2,).
 
-    Fixed-point iteration from `torso`: turn by the difference of azimuth and elevation between the axis and the line
-    to the point. Exact but for the eye's offset from the neck, so each pass divides the error by distance over offset
-    (> 6); the caller starts from its last result. Joint limits are the caller's.
+    One step of a fixed-point iteration from `torso`: turn by the difference of azimuth and elevation between the axis
+    and the line to the point. Exact but for the eye's offset from the neck, so each step divides the error by distance
+    over offset (> 6); the caller takes one each tick, from its last result. Joint limits are the caller's.
     """
-    waist, pitch, yaw = torso
-    for _ in range(iterations):
-        X_OL = head_pose(base, np.array([waist, pitch, yaw]))
-        axis, line = X_OL[:, 2], p_OV - X_OL[:, 3]
-        yaw += wrap(np.arctan2(line[1], line[0]) - np.arctan2(axis[1], axis[0]))
-        pitch += np.arctan2(axis[2], np.hypot(axis[0], axis[1])) - np.arctan2(line[2], np.hypot(line[0], line[1]))
-    return np.array([pitch, yaw])
+    X_OL = head_pose(base, torso)
+    axis, line = X_OL[:, 2], p_OV - X_OL[:, 3]
+    yaw = wrap(np.arctan2(line[1], line[0]) - np.arctan2(axis[1], axis[0]))
+    pitch = np.arctan2(axis[2], np.hypot(axis[0], axis[1])) - np.arctan2(line[2], np.hypot(line[0], line[1]))
+    return torso[1:] + [pitch, yaw]
 
 
 def agree(config: ValveSearchConfig, looks: tuple[tuple[np.ndarray, float], ...], eye: np.ndarray) -> bool:

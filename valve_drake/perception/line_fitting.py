@@ -330,7 +330,7 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         if last:
             break
         curve = curve + smooth
-        settled = step > 0 and np.abs(used * smooth).max() < 0.01 and np.abs(blur - before).max() < 0.01
+        settled = step > 0 and np.abs(used * smooth).max() < 0.03 and np.abs(blur - before).max() < 0.03
         last = settled or step == config.iterations - 2
     edge = curve + moved
     points = np.where(columns, np.stack([t, edge], -1), np.stack([edge, t], -1))

@@ -377,7 +377,7 @@ def _refine(
     p: np.ndarray,
     yaw: float,
     config: RectangleEstimatorConfig,
-    enough: float = 1e-8,
+    enough: float = 1e-6,
 ) -> _Fit | None:
     """Levenberg-Marquardt from (R, p), until a step is expected to lower chi^2 by less than `enough`."""
     n = 7 if config.yaw_sigma > 0 and moments.right.any() else 6
@@ -458,7 +458,7 @@ def _distinct(
     for R, p in starts:
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
             continue
-        fit = _refine(moments, model, R, p, 0.0, config, enough=1e-3)
+        fit = _refine(moments, model, R, p, 0.0, config, enough=0.05)
         if fit is not None and fit.R[2, 2] > 0:
             if not any(np.linalg.norm(frames.rotation_vector(fit.R.T @ other.R)) < 1e-3 for other in fits):
                 fits.append(fit)

@@ -197,7 +197,7 @@ class HealthSystem(Block):
     """The simulated machine reports that all its devices speak."""
 
     OUTPUTS = {"health": Health}
-    DEVICES = ("base", "torso", "left_arm", "right_arm", "left_gripper", "right_gripper", "left_wrist", "right_wrist", *CAMERAS)
+    DEVICES = ("base", "torso", *(f"{s}_{d}" for s in SIDES for d in ("arm", "gripper", "wrist_sensor")), *CAMERAS)
 
     def __init__(self) -> None:
         super().__init__("health", period=1 / 32, slot=0)
