@@ -39,7 +39,7 @@ def test_the_log_is_whole_and_names_its_scenario_and_has_no_result_of_its_own_ma
     reader = LogReader(path)
     assert reader.damage == []
     assert reader.metadata["run"]["seed"] == "4"
-    again = scenarios._apply(scenarios.Scenario(), reader.metadata["run"]["scenario"], "log")
+    again = scenarios.parse(reader.metadata["run"]["scenario"], "log")
     assert scenarios.dump(again) == reader.metadata["run"]["scenario"]
     assert reader.metadata["result"]["outcome"] == "unfinished"
     assert "layout.json" in reader.attachments

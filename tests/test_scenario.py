@@ -10,7 +10,7 @@ from valve_drake.stations.simulation_config import Uniform
 
 def test_shipped_scenario_loads_and_round_trips():
     loaded = mut.load()
-    again = mut._apply(mut.Scenario(), mut.dump(loaded), "dump")
+    again = mut.parse(mut.dump(loaded), "dump")
     assert mut.dump(again) == mut.dump(loaded)
     assert isinstance(loaded.simulation.valve.height, Uniform)
 

@@ -11,20 +11,20 @@ from valve_drake.scenario import Scenario, resolve
 
 # Where each block stands: column, row; and its colour by kind.
 PLACES: dict[str, tuple[float, float]] = {
-    "station": (0, 3.0),
-    "robot_state": (1, 5.0),
-    "color_segmentation": (1, 1.6),
-    "handle_marker": (1, 3.6),
-    "line_fitting": (2, 1.0),
-    "stereo_positioning": (2, 2.3),
-    "rectangle_estimator": (3, 1.0),
-    "valve_search": (4, 0.8),
-    "base_approach": (4, 1.9),
-    "kinematic_approach": (4, 3.0),
-    "image_servo": (4, 4.1),
-    "hybrid_rotation": (4, 5.2),
-    "command_selector": (5.2, 3.9),
-    "supervisor": (5.2, 1.6),
+    "station": (0, 2.7),
+    "robot_state": (1, 4.9),
+    "color_segmentation": (1, 1.2),
+    "handle_marker": (1, 3.4),
+    "stereo_positioning": (2, 0.4),
+    "line_fitting": (2, 1.7),
+    "rectangle_estimator": (3, 1.7),
+    "valve_search": (4, 0.4),
+    "base_approach": (4, 1.5),
+    "kinematic_approach": (4, 2.6),
+    "image_servo": (4, 3.8),
+    "hybrid_rotation": (4, 4.9),
+    "supervisor": (5.4, 1.2),
+    "command_selector": (5.4, 3.8),
 }
 KINDS = {
     "station": "#37474f",
@@ -38,8 +38,9 @@ KINDS = {
     "supervisor": "#6a4c93",
 }
 BEHAVIOR = "#1f5f8b"
-WIDTH, HEIGHT, COLUMN, ROW, LEFT, TOP = 158, 46, 218, 92, 20, 70
-BUSES = {"supervisor": ("mode", "#6a4c93"), "robot_state": ("robot_state", "#546e7a")}
+WIDTH, HEIGHT, COLUMN, ROW, LEFT, TOP = 158, 46, 222, 92, 24, 40
+TO_ALL = {"status": "#6a4c93", "command": "#37474f"}  # ports that every behaviour has: coloured, not labelled
+BUSES = {"supervisor.mode": "#6a4c93", "robot_state.robot_state": "#546e7a", "station.health": "#c77d0a"}
 
 
 def write(scenario: Scenario, name: str, folder: Path) -> list[Path]:
@@ -65,23 +66,29 @@ def svg(diagram: Diagram) -> str:
     for line in wiring(diagram):
         source, target = line.split(" -> ")
         (a, port), (b, _) = source.split(".", 1), target.split(".", 1)
-        if a in BUSES and port == BUSES[a][0]:
-            buses[a].append(b)
+        if source in BUSES:
+            buses[source].append(b)
         else:
             edges.setdefault((a, b), []).append(port)
     names = {system.get_name() for system in diagram.GetSystems()}
-    width = int(LEFT * 2 + 5.2 * COLUMN + WIDTH)
-    height = int(TOP + 6.9 * ROW)
+    width = int(LEFT * 2 + 5.4 * COLUMN + WIDTH + 36)
+    height = int(TOP + 6.3 * ROW)
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
         'font-family="Helvetica, Arial, sans-serif">',
         '<defs><marker id="a" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
         '<path d="M0 0L8 4L0 8z" fill="#607d8b"/></marker></defs>',
         f'<rect width="{width}" height="{height}" fill="#fbfbf8"/>',
-        f'<text x="{LEFT}" y="30" font-size="19" font-weight="bold" fill="#263238">valve_drake</text>',
-        f'<text x="{LEFT + 126}" y="30" font-size="13" fill="#607d8b">one arrow for all ports between two blocks; '
-        "squares read the mode (purple) and the robot's state (grey)</text>",
+        f'<text x="{LEFT}" y="28" font-size="13" fill="#607d8b">One arrow for all ports between two blocks. Squares: '
+        "reads the mode (purple), the robot's state (grey), its health (amber). "
+        "Arrows: status (purple), command (dark).</text>",
     ]
+    x, y = _corner("supervisor")
+    parts.append(
+        f'<path d="M{x + WIDTH / 2:.0f} {y - 34:.0f}L{x + WIDTH / 2:.0f} {y:.0f}" stroke="#90a4ae" stroke-width="1.6" '
+        f'marker-end="url(#a)"/><text x="{x + WIDTH / 2:.0f}" y="{y - 40:.0f}" font-size="12" fill="#455a64" '
+        'text-anchor="middle">operator</text>'
+    )
     parts += [_edge(a, b, ports) for (a, b), ports in sorted(edges.items())]
     parts += [_block(name, [bus for bus in BUSES if name in buses[bus]]) for name in sorted(names)]
     return "\n".join([*parts, "</svg>"]) + "\n"
@@ -102,7 +109,7 @@ def _block(name: str, reads: Iterable[str]) -> str:
     ]
     for k, bus in enumerate(reads):
         out.append(
-            f'<rect x="{x + 8 + 14 * k:.0f}" y="{y - 5:.0f}" width="10" height="10" fill="{BUSES[bus][1]}" '
+            f'<rect x="{x + 8 + 14 * k:.0f}" y="{y - 5:.0f}" width="10" height="10" fill="{BUSES[bus]}" '
             'stroke="white" stroke-width="1.5"/>'
         )
     return "".join(out)
@@ -111,7 +118,8 @@ def _block(name: str, reads: Iterable[str]) -> str:
 def _edge(a: str, b: str, ports: list[str]) -> str:
     (xa, ya), (xb, yb) = _corner(a), _corner(b)
     short = ports[0] if len(ports) == 1 else f"{len(ports)} ports"
-    style = 'fill="none" stroke="#90a4ae" stroke-width="1.6" marker-end="url(#a)"'
+    color = TO_ALL.get(ports[0], "#90a4ae") if len(ports) == 1 else "#90a4ae"
+    style = f'fill="none" stroke="{color}" stroke-opacity="0.75" stroke-width="1.6" marker-end="url(#a)"'
     if xb > xa:
         x0, y0, x1, y1 = xa + WIDTH, ya + HEIGHT / 2, xb, yb + HEIGHT / 2
         bend = max(40.0, (x1 - x0) / 2)
@@ -121,13 +129,13 @@ def _edge(a: str, b: str, ports: list[str]) -> str:
         side = xa + WIDTH
         y0, y1 = ya + HEIGHT / 2 + 8, yb + HEIGHT / 2 - 8
         path = f"M{side:.0f} {y0:.0f}C{side + 46:.0f} {y0:.0f} {side + 46:.0f} {y1:.0f} {side:.0f} {y1:.0f}"
-        label = (side + 38, (y0 + y1) / 2)
+        label = (side + 30, (y0 + y1) / 2 + 3)
     else:  # back to an earlier column: below everything
-        low = TOP + 6.5 * ROW
+        low = TOP + 6.0 * ROW
         x0, y0, x1, y1 = xa + WIDTH / 2, ya + HEIGHT, xb + WIDTH / 2, yb + HEIGHT
         path = f"M{x0:.0f} {y0:.0f}L{x0:.0f} {low:.0f}L{x1:.0f} {low:.0f}L{x1:.0f} {y1:.0f}"
         label = ((x0 + x1) / 2, low - 6)
-    text = (
+    text = "" if ports[0] in TO_ALL else (
         f'<text x="{label[0]:.0f}" y="{label[1]:.0f}" font-size="10" fill="#78909c" '
         f'paint-order="stroke" stroke="#fbfbf8" stroke-width="3">{escape(short)}</text>'
     )

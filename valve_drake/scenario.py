@@ -90,16 +90,15 @@ def load(path: str | None = None, overrides: typing.Sequence[str] = ()) -> Scena
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file.name}: cannot be read ({type(error).__name__})") from error
-    scenario = _apply(Scenario(), text, file.name)
+    scenario = parse(text, file.name)
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set {override}: want key=value, e.g. simulation.valve.friction=7.3")
-        nested: Any = f"{value}"
         lines = key.strip().split(".")
         text = "".join("  " * k + f"{name}:\n" for k, name in enumerate(lines[:-1]))
-        text += "  " * (len(lines) - 1) + f"{lines[-1]}: {nested}\n"
-        scenario = _apply(scenario, text, f"--set {key}")
+        text += "  " * (len(lines) - 1) + f"{lines[-1]}: {value}\n"
+        scenario = parse(text, f"--set {key}", scenario)
     scenario.check()
     return scenario
 
@@ -127,7 +126,9 @@ def resolve(scenario: Scenario) -> Scenario:
     return out
 
 
-def _apply(scenario: Scenario, text: str, source: str) -> Scenario:
+def parse(text: str, source: str, defaults: Scenario | None = None) -> Scenario:
+    """A scenario from YAML text on top of `defaults`; `source` is named in errors."""
+    scenario = Scenario() if defaults is None else defaults
     try:
         tree = yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:

@@ -152,7 +152,7 @@ class ImageServo:
         p = hand.X_HG[:, 3] + step * min(1.0, most / max(length, 1e-12))
         X_HG = make(hand.X_HG[:, :3], p)
         solution = self.geometry.arm_inverse(X_HG, side, hand.q)
-        if solution is None:  # at the edge of reach: stay
+        if solution is None or np.max(np.abs(solution - hand.q)) > 0.5:  # at the edge of reach, or the wrist would swing: stay
             return hand
         return dc.replace(hand, X_HG=X_HG, q=solution)
 

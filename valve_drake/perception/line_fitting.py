@@ -207,7 +207,7 @@ def _hough_corners(channel: np.ndarray, corners: np.ndarray) -> np.ndarray:
     ends = corners[NEXT]
     lengths = np.linalg.norm(ends - corners, axis=1)
     votes = max(int(0.35 * lengths.min()), 4)
-    found = cv2.HoughLines(cv2.bitwise_and(edges, band), 1.0, np.pi / 180, votes)
+    found = cv2.HoughLines(cv2.bitwise_and(edges, band), 1.0, np.pi / 90, votes)
     direction = (ends - corners) / lengths[:, None]
     lines = np.column_stack([-direction[:, 1], direction[:, 0], np.zeros(4)])
     lines[:, 2] = -(lines[:, :2] * corners).sum(1)
@@ -316,12 +316,10 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         shift = -_dot(pull, residual) / strength  # of each profile's edge, along the inward normal
         left = residual + gain * shift.astype(np.float32)[:, :, None]
         square = _dot(weight * left, left) / np.maximum(weight.sum(-1), 1)
-        before = blur
-        if step > 0:
-            pull *= z  # weight times -d model / d blur
-            wrong, scale = (good * _dot(pull, left)).sum(1), (good * _dot(pull, gain * z)).sum(1)
-            change = wrong.reshape(-1, 4).sum(1) / np.maximum(scale.reshape(-1, 4).sum(1), 1e-12)
-            blur = np.clip(blur - np.repeat(change, 4), 0.35, 3.0)
+        pull *= z  # weight times -d model / d blur
+        wrong, scale = (good * _dot(pull, left)).sum(1), (good * _dot(pull, gain * z)).sum(1)
+        change = np.repeat(wrong.reshape(-1, 4).sum(1) / np.maximum(scale.reshape(-1, 4).sum(1), 1e-12), 4)
+        blur = np.clip(blur - np.clip(change, -0.5, 0.5), 0.35, 3.0)
         typical = _median(square, used)
         good = used * (square < 6 * typical[:, None] + 4e-4) * (strength > 0.2 * strength.max(1, keepdims=True))
         moved = (inward / cosine)[:, None] * np.clip(shift, -1.5, 1.5)
@@ -330,7 +328,7 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         if last:
             break
         curve = curve + smooth
-        settled = step > 0 and np.abs(used * smooth).max() < 0.03 and np.abs(blur - before).max() < 0.03
+        settled = np.abs(used * smooth).max() < 0.04 and np.abs(change).max() < 0.04
         last = settled or step == config.iterations - 2
     edge = curve + moved
     points = np.where(columns, np.stack([t, edge], -1), np.stack([edge, t], -1))

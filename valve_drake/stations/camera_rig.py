@@ -73,10 +73,14 @@ def lights(config: LightConfig) -> list[LightParameter]:
     """A lamp in the room, and the robot's own light above its eyes. Each one costs the renderer a fifth of a frame."""
     a, k = config.azimuth, config.intensity
     lamp = [np.cos(a), np.sin(a), -0.9]
-    return [
+    out = [
         LightParameter(type="directional", direction=lamp, frame="world", intensity=0.75 * k),
         LightParameter(type="directional", direction=[0.1, 0.25, 1.0], frame="camera", intensity=0.55 * k),
     ]
+    for angle in (a + 2.1, a - 2.1):
+        side = [np.cos(angle), np.sin(angle), -0.6]
+        out.append(LightParameter(type="directional", direction=side, frame="world", intensity=config.fill * k))
+    return out if config.fill > 0 else out[:2]
 
 
 class CameraRig:

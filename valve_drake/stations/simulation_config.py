@@ -47,6 +47,7 @@ class LightConfig:
 
     intensity: Number = 1.0  # of the lamps
     azimuth: Number = 0.6  # of the main lamp [rad]
+    fill: float = 0.0  # two more lamps of this intensity, for pictures
     red_gain: Number = 1.0  # white balance
     blue_gain: Number = 1.0
 
@@ -104,6 +105,7 @@ class SimulationConfig:
             "start.heading": (-3.1416, 3.1416),
             "light.intensity": (0.1, 3.0),
             "light.azimuth": (-3.1416, 3.1416),
+            "light.fill": (0.0, 1.0),
             "light.red_gain": (0.3, 2.0),
             "light.blue_gain": (0.3, 2.0),
             "camera.noise": (0.0, 20.0),
