@@ -49,7 +49,7 @@ def true_center(X_LV):
 )
 def test_marker_is_the_best_candidate_at_every_distance_and_light(z, finish):
     X = facing(z, 0.3, -0.2, 0.4)
-    candidates, green = segment(valve_image(X, np.random.default_rng(1), **finish), CONFIG)
+    candidates, _ = segment(valve_image(X, np.random.default_rng(1), **finish), CONFIG)
     assert not candidates[0].rejected
     side = 1075 * 0.098 / z
     # Perspective moves the area's centroid off the centre's image.
@@ -191,7 +191,7 @@ def test_block_looks_every_eighth_step_while_turning():
 
 
 def test_block_follows_and_finds_again_after_a_jump():
-    image, dut = rig("rough_approach", every={"rough_approach": 1})
+    _, dut = rig("rough_approach", every={"rough_approach": 1})
     dut.run(0.1)
     moved = valve_image(facing(2.0, 0.2, 0.1, x=0.35), np.random.default_rng(1))
     dut.fix(head_left_image=frame("l", moved, 1), head_right_image=frame("r", moved, 1))

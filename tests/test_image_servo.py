@@ -217,6 +217,18 @@ def test_a_joint_servo_that_sags_does_not_keep_the_hand_off():
         assert bench.off(side) < 0.0010
 
 
+def test_a_hand_that_is_held_fast_is_not_pressed_on_for_ever():
+    """What keeps the hand off its command may be an obstacle: the command leads by a bounded way only."""
+    bench = Bench(7, reach=0.03)
+    for _ in range(int(5 / DT)):
+        bench.queue = bench.queue[:1] * 3
+        bench.step()
+    for side in SIDES:
+        p = GEOMETRY.arm_forward(getattr(bench.commands[-1], f"{side}_arm"), side)[:, 3]
+        gap = np.linalg.norm(p - bench.X(side)[:, 3])
+        assert gap < CONFIG.gain * bench.off(side) + CONFIG.sag + 0.001
+
+
 # ---------------------------------------------------------------- it says when it cannot
 
 

@@ -185,3 +185,16 @@ def test_block():
 def test_bad_config_is_refused(bad):
     with pytest.raises(ConfigError, match=f"stereo_positioning.{next(iter(bad))}"):
         dc.replace(CONFIG, **bad).check()
+
+
+def test_a_small_oblong_marker_is_found_although_its_sides_could_be_exchanged():
+    """At 28 x 19 px a tilted 120 x 80 mm rectangle looks like one with its sides exchanged, at another distance."""
+    oblong = Marker(size=[0.12, 0.08])
+    rng = np.random.default_rng(7)
+    for _ in range(200):
+        X = facing(rng.uniform(3.5, 5.0), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3), x=0.1, y=0.1)
+        pair = [
+            tuple(dc.replace(c, corners=c.corners + rng.normal(0, 0.7, (4, 2))) for c in side)
+            for side in candidates_of((X, 0.12, 0.08))
+        ]
+        assert match(*pair, HEAD, oblong, CONFIG).reason == ""

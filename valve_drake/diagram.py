@@ -23,6 +23,7 @@ from valve_drake.behaviors.taught import load_taught
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import load_head
 from valve_drake.collision import CollisionModel
+from valve_drake.frames import compose, make
 from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import SIDES, OperatorCommand
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
@@ -130,6 +131,7 @@ def make_blocks(scenario: Scenario) -> list:
     marker = scenario.marker
     view = {side: taught[side].view for side in SIDES}
     area = {side: taught[side].area for side in SIDES}
+    X_LMiddle = make(np.eye(3), head.X_LR[:, 3] / 2)  # the gaze is that of both eyes, or near things leave one of them
     collision = CollisionModel(marker, opening=scenario.kinematic_approach.opening)
     return [
         RobotStateSystem(),
@@ -138,7 +140,7 @@ def make_blocks(scenario: Scenario) -> list:
         StereoPositioningSystem(scenario.stereo_positioning, head, GEOMETRY.head_pose, marker),
         RectangleEstimatorSystem(scenario.rectangle_estimator, head, GEOMETRY.head_pose, marker),
         HandleMarkerSystem(scenario.handle_marker),
-        ValveSearchSystem(scenario.valve_search, GEOMETRY.head_pose),
+        ValveSearchSystem(scenario.valve_search, lambda base, torso: compose(GEOMETRY.head_pose(base, torso), X_LMiddle)),
         BaseApproachSystem(scenario.base_approach),
         KinematicApproachSystem(
             KinematicApproach(

@@ -135,8 +135,12 @@ def _edge(a: str, b: str, ports: list[str]) -> str:
         x0, y0, x1, y1 = xa + WIDTH / 2, ya + HEIGHT, xb + WIDTH / 2, yb + HEIGHT
         path = f"M{x0:.0f} {y0:.0f}L{x0:.0f} {low:.0f}L{x1:.0f} {low:.0f}L{x1:.0f} {y1:.0f}"
         label = ((x0 + x1) / 2, low - 6)
-    text = "" if ports[0] in TO_ALL else (
-        f'<text x="{label[0]:.0f}" y="{label[1]:.0f}" font-size="10" fill="#78909c" '
-        f'paint-order="stroke" stroke="#fbfbf8" stroke-width="3">{escape(short)}</text>'
+    text = (
+        ""
+        if ports[0] in TO_ALL
+        else (
+            f'<text x="{label[0]:.0f}" y="{label[1]:.0f}" font-size="10" fill="#78909c" '
+            f'paint-order="stroke" stroke="#fbfbf8" stroke-width="3">{escape(short)}</text>'
+        )
     )
     return f'<path d="{path}" {style}/>{text}'

@@ -54,6 +54,4 @@ class RobotStateSystem(Block):
             sides[f"{side}_gripper"] = float(read[f"{side}_gripper.position_measured"][0])
             sides[f"{side}_gripper_force"] = float(read[f"{side}_gripper.force_measured"][0])
             sides[f"{side}_wrench"] = read[f"{side}_wrist.wrench"]
-        return history, {
-            "robot_state": RobotState(time=time, odometry=odometry, torso=torso, history=history, **sides)
-        }
+        return history, {"robot_state": RobotState(time=time, odometry=odometry, torso=torso, history=history, **sides)}

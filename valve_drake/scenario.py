@@ -116,7 +116,9 @@ def resolve(scenario: Scenario) -> Scenario:
             stream = np.random.Generator(np.random.SFC64([scenario.seed, zlib.crc32(key.encode())]))
             return float(stream.uniform(value.min, value.max))
         if dc.is_dataclass(value):
-            return dc.replace(value, **{f.name: draw(f"{key}.{f.name}", getattr(value, f.name)) for f in dc.fields(value)})
+            return dc.replace(
+                value, **{f.name: draw(f"{key}.{f.name}", getattr(value, f.name)) for f in dc.fields(value)}
+            )
         return value
 
     out = dc.replace(scenario, simulation=draw("simulation", scenario.simulation))

@@ -50,7 +50,9 @@ def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.
     for side in SIDES:
         X_HG = compose(inverse(GEOMETRY.X_BH()), X_BV, hand_in_valve(side, arc.swapped, marker))
 
-        def look(offset: np.ndarray, side: str = side, X_HG: np.ndarray = X_HG) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+        def look(
+            offset: np.ndarray, side: str = side, X_HG: np.ndarray = X_HG
+        ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
             moved = make(X_HG[:, :3], X_HG[:, 3] + X_HG[:, :3] @ offset)
             q = GEOMETRY.arm_inverse(moved, side, q0[side])
             if q is None:

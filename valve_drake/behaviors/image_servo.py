@@ -50,6 +50,7 @@ class ImageServoConfig:
     tolerance: float = 0.0015  # distance from the reference that counts as there [m]
     images_in_tolerance: int = 3
     lost_after: float = 1.0  # without a mark [s]
+    sag: float = 0.003  # most of the hand's way short of its command that is made up for [m]
     reach: float = 0.20  # farther from the start of servoing than this is a runaway [m]
     opening: float = 0.085  # [m]
     gripper_force: float = 40.0  # [N]
@@ -71,7 +72,7 @@ class Hand:
     seen_at: float = 0.0
     error: np.ndarray = dc.field(default_factory=lambda: np.full(3, np.nan))
     inside: int = 0  # images in tolerance in a row
-    past: tuple[tuple[float, np.ndarray], ...] = ()  # (time, measured p_HG), newest last
+    past: tuple[tuple[float, np.ndarray], ...] = ()  # (time, p_HG measured, plus what is missing to the command), newest last
 
 
 @dc.dataclass(frozen=True)
@@ -129,7 +130,9 @@ class ImageServo:
     def _hand(self, time: float, dt: float, hand: Hand, state: RobotState, side: str, mark: HandleMark) -> Hand:
         q = state.left_arm if side == LEFT else state.right_arm
         p_now = self.geometry.arm_forward(q, side)[:, 3]
-        hand = dc.replace(hand, past=(*hand.past[-31:], (time, p_now)))
+        short = hand.X_HG[:, 3] - p_now  # joints that stand off their command for ever must not keep the hand off
+        short = short * min(1.0, self.config.sag / max(float(np.linalg.norm(short)), 1e-12))
+        hand = dc.replace(hand, past=(*hand.past[-31:], (time, p_now + short)))
         if mark.found and mark.sequence != hand.seen and mark.time >= hand.past[0][0]:
             e = self.taught[side].displacement(mark.feature)
             R = hand.X_HG[:, :3]

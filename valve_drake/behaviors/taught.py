@@ -44,7 +44,12 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
         data = yaml.safe_load(pathlib.Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError(f"taught references {path}: cannot be read ({type(error).__name__})") from error
-    require(isinstance(data, dict) and set(data) == set(SIDES), f"taught references {path}", "a mapping of left and right", data)
+    require(
+        isinstance(data, dict) and set(data) == set(SIDES),
+        f"taught references {path}",
+        "a mapping of left and right",
+        data,
+    )
     out = {}
     for side in SIDES:
         values = {}
@@ -54,7 +59,9 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
                 value = np.array(data[side][name], float)
             except (KeyError, TypeError, ValueError) as error:
                 raise ConfigError(f"{key} must be {shape} numbers") from error
-            require(value.shape == shape and bool(np.isfinite(value).all()), key, f"{shape} finite numbers", value.tolist())
+            require(
+                value.shape == shape and bool(np.isfinite(value).all()), key, f"{shape} finite numbers", value.tolist()
+            )
             values[name] = float(value) if shape == () else value
         require(values["area"] > 0, f"taught references {path}: {side}.area", "> 0", values["area"])
         try:

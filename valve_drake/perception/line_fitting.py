@@ -16,13 +16,15 @@ import numpy as np
 
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require_in
-from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, Segmentation, SegmentationPair
+from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, SegmentationPair
 from valve_drake.perception.color_segmentation import polygon_area
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig, match, single
 
 _BEFORE = [3, 0, 1, 2]
-_TAU_POWER = [[0, 1, 0, 1], [1, 2, 1, 2], [0, 1, 0, 1], [1, 2, 1, 2]]
+# Of the six functions 1, tau, rise, tau rise, bell, tau bell: the index of each product, and its power of tau.
+_PRODUCT = np.repeat(np.repeat([[0, 1, 2], [1, 3, 4], [2, 4, 5]], 2, axis=0), 2, axis=1)
+_TAU_POWER = np.tile([[0, 1], [1, 2]], (3, 3))
 _PAD = 12  # room round the quadrilateral [px]
 _PRIOR_POINTS = 20  # how many points the noise predicted from the grey values counts for, against the scatter seen
 
@@ -33,7 +35,7 @@ class LineFittingConfig:
     trim: float = 2.5  # of a side at each corner, beyond the profile's reach [px]
     gamma: float = 1.0  # light = value^gamma; 1 if pixel values are linear in light, 2.2 for ordinary cameras
     iterations: int = 5
-    max_sigma: float = 0.6  # scatter of the edge points about the side [px]
+    max_sigma: float = 0.4  # scatter of the edge points about the side [px]
     min_contrast: float = 10.0  # between inside and outside [grey levels, over all channels]
     min_share: float = 0.5  # of a side's profiles that must fit
     color_only: bool = False  # compare colours and not brightness: for a mark whose surroundings are bright and dark
@@ -71,22 +73,21 @@ def fit_pair(
     matching: StereoPositioningConfig,
 ) -> MarkerEdges:
     """Edges of the marker in both head images: of the pair of candidates that `match` chooses."""
-    sides = ((pair.left, head.left), (pair.right, head.right))
+    cameras = ((pair.left, head.left), (pair.right, head.right))
     found = match(pair.left.candidates, pair.right.candidates, head, marker, matching)
     chosen = [found.left, found.right]
     if found.reason and config.single_camera:
-        chosen = [single(seen.candidates, lens, marker, matching) for seen, lens in sides]
+        chosen = [single(seen.candidates, lens, marker, matching) for seen, lens in cameras]
         if min(chosen) >= 0:  # both see one, but not the same: neither can be trusted
             chosen = [-1, -1]
-    sides = [(seen, lens, seen.candidates[k]) if k >= 0 else None for (seen, lens), k in zip(sides, chosen)]
-    used = [one for one in sides if one is not None]
-    raw = iter(fit_quads([seen.frame.image for seen, _, _ in used], [c.corners for _, _, c in used], config))
-    quads = [
-        QuadEdges(reason=found.reason)
-        if one is None
-        else _edges_of(next(raw), one[2], one[0].green, one[1], config.max_sigma)
-        for one in sides
-    ]
+    quads = [QuadEdges(reason=found.reason)] * 2
+    used = [k for k in (0, 1) if chosen[k] >= 0]
+    candidates = [cameras[k][0].candidates[chosen[k]] for k in used]
+    images = [cameras[k][0].frame.image for k in used]
+    raw = fit_quads(images, [candidate.corners for candidate in candidates], config)
+    for k, candidate, one in zip(used, candidates, raw):
+        seen, lens = cameras[k]
+        quads[k] = _edges_of(one, candidate, seen.green, lens, config.max_sigma)
     return MarkerEdges(time=pair.time, sequence=pair.sequence, left=quads[0], right=quads[1])
 
 
@@ -207,7 +208,7 @@ def _hough_corners(channel: np.ndarray, corners: np.ndarray) -> np.ndarray:
     ends = corners[NEXT]
     lengths = np.linalg.norm(ends - corners, axis=1)
     votes = max(int(0.35 * lengths.min()), 4)
-    found = cv2.HoughLines(cv2.bitwise_and(edges, band), 1.0, np.pi / 90, votes)
+    found = cv2.HoughLines(cv2.bitwise_and(edges, band), 1.0, np.pi / 180, votes)
     direction = (ends - corners) / lengths[:, None]
     lines = np.column_stack([-direction[:, 1], direction[:, 0], np.zeros(4)])
     lines[:, 2] = -(lines[:, :2] * corners).sum(1)
@@ -305,7 +306,7 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         z = (inward * cosine / blur).astype(np.float32)[:, None, None] * offset
         bell = np.exp(-0.5 * z * z) * np.float32(1 / np.sqrt(2 * np.pi))
         rise = _normal_cdf(z, bell)
-        level = _levels(weight, good, rise, f, tau)
+        level = _levels(weight, good, rise, bell, f, tau)
         has_step &= level[:, 2] >= 0.3
         base = (level[:, 0:1] + level[:, 1:2] * tau).astype(np.float32)
         height = np.maximum(level[:, 2:3] + level[:, 3:4] * tau, 0.05).astype(np.float32)  # (S, N)
@@ -328,7 +329,7 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         if last:
             break
         curve = curve + smooth
-        settled = np.abs(used * smooth).max() < 0.04 and np.abs(change).max() < 0.04
+        settled = np.abs(used * smooth).max() < 0.2 and np.abs(change).max() < 0.05  # the next step is the square of it
         last = settled or step == config.iterations - 2
     edge = curve + moved
     points = np.where(columns, np.stack([t, edge], -1), np.stack([edge, t], -1))
@@ -364,17 +365,25 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("snm,snm->sn", a, b)
 
 
-def _levels(weight: np.ndarray, good: np.ndarray, rise: np.ndarray, f: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """Least squares of f = (b0 + b1 tau) + (a0 + a1 tau) rise on each side -> (S, 4): b0, b1, a0, a1."""
-    risen = weight * rise
-    sums = np.stack([weight.sum(-1), risen.sum(-1), _dot(risen, rise)]) * good  # of 1, rise, rise^2 in each profile
-    right = np.stack([_dot(weight, f), _dot(risen, f)]) * good
+def _levels(
+    weight: np.ndarray, good: np.ndarray, rise: np.ndarray, bell: np.ndarray, f: np.ndarray, tau: np.ndarray
+) -> np.ndarray:
+    """Least squares of f = (b0 + b1 tau) + (a0 + a1 tau) rise + (c0 + c1 tau) bell -> (S, 4): b0, b1, a0, a1.
+
+    The bell's share is what a shift and a turn of the side would change. Without it the levels would take part of
+    a wrong start for themselves, and the fit would creep.
+    """
+    risen, belled = weight * rise, weight * bell
+    sums = np.stack(
+        [weight.sum(-1), risen.sum(-1), belled.sum(-1), _dot(risen, rise), _dot(risen, bell), _dot(belled, bell)]
+    )
+    right = np.stack([_dot(weight, f), _dot(risen, f), _dot(belled, f)]) * good
     powers = np.stack([np.ones_like(tau), tau, tau * tau])
-    m = np.einsum("asn,psn->sap", sums, powers)
-    r = np.einsum("asn,psn->sap", right, powers[:2]).reshape(-1, 4)
-    normal = m[:, [[0, 0, 1, 1], [0, 0, 1, 1], [1, 1, 2, 2], [1, 1, 2, 2]], _TAU_POWER]
+    m = np.einsum("asn,psn->sap", sums * good, powers)
+    r = np.einsum("asn,psn->sap", right, powers[:2]).reshape(-1, 6)
     # A short side shows no trend: hold it near zero there.
-    return np.linalg.solve(normal + np.diag([1e-9, 0.1, 1e-9, 0.1]), r[:, :, None])[:, :, 0]
+    normal = m[:, _PRODUCT, _TAU_POWER] + np.diag([1e-9, 0.1, 1e-9, 0.1, 1e-6, 1e-6])
+    return np.linalg.solve(normal, r[:, :, None])[:, :4, 0]
 
 
 def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:

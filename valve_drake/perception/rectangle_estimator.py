@@ -262,7 +262,7 @@ def _robust_lines(
 
 
 def _weighted_lines(points: np.ndarray, side: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    total, mean, scatter = _side_moments(points, side, weight)
+    _, mean, scatter = _side_moments(points, side, weight)
     angle = np.arctan2(2 * scatter[:, 0, 1], scatter[:, 0, 0] - scatter[:, 1, 1]) / 2
     normal = np.stack([-np.sin(angle), np.cos(angle)], -1)
     return np.column_stack([normal, -(normal * mean).sum(1)])

@@ -63,14 +63,14 @@ def match(
     seen = []
     for candidates, lens in ((left, head.left), (right, head.right)):
         accepted = [k for k, c in enumerate(candidates) if not c.rejected]
-        seen.append([(k, *_by_size(candidates[k], lens, marker)) for k in accepted])
+        seen.append([(k, _by_size(candidates[k], lens, marker)) for k in accepted])
     for side, one in zip(("left", "right"), seen):
         if not one:
             return Match(reason=f"no candidate in the {side} image")
     best, least, reason = None, math.inf, ""
-    for i, depth_i, misfit_i in seen[0]:
-        for j, depth_j, misfit_j in seen[1]:
-            cost, why = _disagreement(left[i], right[j], depth_i, depth_j, max(misfit_i, misfit_j), head, config)
+    for i, fits_i in seen[0]:
+        for j, fits_j in seen[1]:
+            cost, why = _disagreement(left[i], right[j], fits_i, fits_j, head, config)
             if why:
                 reason = reason or f"candidates {i}, {j}: {why}"
             elif cost < least:
@@ -101,9 +101,9 @@ def single(
     corners fit the rectangle at a plausible distance."""
     for k, candidate in enumerate(candidates):
         if not candidate.rejected:
-            depth, misfit = _by_size(candidate, lens, marker)
-            if misfit < _shape_gate(candidate, config) and config.min_distance < depth < config.max_distance:
-                return k
+            for depth, misfit in _by_size(candidate, lens, marker):
+                if misfit < _shape_gate(candidate, config) and config.min_distance < depth < config.max_distance:
+                    return k
     return -1
 
 
@@ -146,20 +146,24 @@ def triangulate(
     return p, N * sigma**2 + np.outer(by_yaw, by_yaw), float(np.linalg.norm(r))
 
 
-def _by_size(candidate: MarkerCandidate, lens: LensModel, marker: Marker) -> tuple[float, float]:
-    """Depth of a candidate by the marker's known size, and the misfit of its corners as a share of its size."""
+def _by_size(candidate: MarkerCandidate, lens: LensModel, marker: Marker) -> list[tuple[float, float]]:
+    """Depth of a candidate by the marker's known size, and the misfit of its corners as a share of its size; for a
+    marker that is no square once for either choice of its long sides.
+
+    A few pixels do not tell a rectangle from one with its sides exchanged and tilted: that choice is not made here.
+    """
     corners = lens.normalize(candidate.corners)
     size = math.sqrt(max(candidate.area, 1.0)) / lens.focal()
-    best = (math.inf, math.inf)
-    turns = (0, 1) if marker.aspect() > 1.03 else (0,)  # which sides are the long ones
-    for turn in turns:
+    fits = []
+    for turn in (0, 1) if marker.aspect() > 1.03 else (0,):
         # Corners of a mask lie half a pixel inside; the area does not.
-        O = np.roll(marker.corners(), turn, axis=0)
+        rectangle = np.roll(marker.corners(), turn, axis=0)
+        best = (math.inf, math.inf)
         ok, rvecs, tvecs, _ = cv2.solvePnPGeneric(
-            O, corners[:, None, :], np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
+            rectangle, corners[:, None, :], np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
         )
         for rvec, tvec in zip(rvecs, tvecs) if ok else ():
-            X = O @ cv2.Rodrigues(rvec)[0].T + tvec.ravel()
+            X = rectangle @ cv2.Rodrigues(rvec)[0].T + tvec.ravel()
             if not (X[:, 2] > 1e-6).all():
                 continue
             seen = X[:, :2] / X[:, 2:]
@@ -168,7 +172,8 @@ def _by_size(candidate: MarkerCandidate, lens: LensModel, marker: Marker) -> tup
                 p, q = seen, seen[NEXT]
                 area = abs((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()) / 2
                 best = (float(tvec[2, 0]) * math.sqrt(area) / size, misfit)
-    return best
+        fits.append(best)
+    return fits
 
 
 def _shape_gate(candidate: MarkerCandidate, config: StereoPositioningConfig) -> float:
@@ -178,16 +183,16 @@ def _shape_gate(candidate: MarkerCandidate, config: StereoPositioningConfig) -> 
 def _disagreement(
     left: MarkerCandidate,
     right: MarkerCandidate,
-    depth_left: float,
-    depth_right: float,
-    misfit: float,
+    fits_left: list[tuple[float, float]],
+    fits_right: list[tuple[float, float]],
     head: StereoHead,
     config: StereoPositioningConfig,
 ) -> tuple[float, str]:
     """How badly a pair fits one marker (small is good), or why it cannot be one."""
     gate = min(_shape_gate(left, config), _shape_gate(right, config))
-    if misfit > gate:
-        return 0.0, f"shape: corners off by {misfit:.2f} of its size"
+    misfits = [max(a[1], b[1]) for a, b in zip(fits_left, fits_right)]
+    if min(misfits) > gate:
+        return 0.0, f"shape: corners off by {min(misfits):.2f} of its size"
     p, _, off = triangulate(left.center, right.center, head, config.center_sigma)
     if not np.isfinite(p).all():
         return 0.0, "rays do not meet"
@@ -202,7 +207,11 @@ def _disagreement(
     disparity = head.right.focal() * np.linalg.norm(head.X_LR[:, 3]) / p[2]
     allowed = config.size_gate + config.corner_sigma * (small + 1 / disparity)
     p_R = frames.apply(frames.inverse(head.X_LR), p)
-    wrong = max(abs(math.log(depth_left / p[2])), abs(math.log(depth_right / p_R[2])))
+    wrong, misfit = min(
+        (max(abs(math.log(a[0] / p[2])), abs(math.log(b[0] / p_R[2]))), m)
+        for a, b, m in zip(fits_left, fits_right, misfits)
+        if m <= gate
+    )
     if wrong > allowed:
         return 0.0, f"size: {math.exp(wrong):.2f} times off"
     return (off / config.epipolar_gate) ** 2 + (wrong / allowed) ** 2 + (misfit / gate) ** 2, ""

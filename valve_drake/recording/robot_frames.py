@@ -42,9 +42,7 @@ class RobotFrames:
     def _slot(self, joint: str) -> int:
         return self._plant.GetJointByName(joint).position_start()
 
-    def __call__(
-        self, state: RobotState, estimate: RectangleEstimate, plan: GraspPlan, turn: TurnState
-    ) -> Transforms:
+    def __call__(self, state: RobotState, estimate: RectangleEstimate, plan: GraspPlan, turn: TurnState) -> Transforms:
         """(parent, child, X) of all bodies, the head cameras and the valve; poses a display model only."""
         q = np.array(self._plant.GetPositions(self._context))
         q[self._slots["base"]] = state.odometry[:3]
@@ -67,7 +65,11 @@ class RobotFrames:
         if X_OV is not None:
             back = make(np.eye(3), np.array([0.0, 0.0, -self._marker.panel_depth]))
             X_OWheel = compose(X_OV, inverse(back))
-            out += [(ODOMETRY, "marker", X_OV), (ODOMETRY, "valve::wheel", X_OWheel), (ODOMETRY, "valve::panel", X_OWheel)]
+            out += [
+                (ODOMETRY, "marker", X_OV),
+                (ODOMETRY, "valve::wheel", X_OWheel),
+                (ODOMETRY, "valve::panel", X_OWheel),
+            ]
         return out
 
 

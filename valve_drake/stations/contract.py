@@ -69,7 +69,9 @@ def check_contract(station: Diagram) -> None:
     wrong = [f"missing {name}" for name in wanted if name not in found]
     wrong += [f"extra {name}" for name in found if name not in wanted]
     wrong += [
-        f"{name} is {found[name]}, not {wanted[name]}" for name in wanted if name in found and found[name] != wanted[name]
+        f"{name} is {found[name]}, not {wanted[name]}"
+        for name in wanted
+        if name in found and found[name] != wanted[name]
     ]
     if wrong:
         raise TypeError(f"{station.get_name()} breaks the station contract: " + "; ".join(wrong))

@@ -15,7 +15,7 @@ from valve_drake.frames import make, rot_y, rot_z
 from valve_drake.stations.simulation_config import StartConfig, ValveConfig
 
 MARKER_RED = (0.80, 0.06, 0.05, 1.0)
-MARKER_THICKNESS = 1e-4  # a sticker: a plate would show its rim to a camera from above [m]
+MARKER_THICKNESS = 1e-5  # a sticker: a plate would show its rim to a camera from above [m]
 SEIZED = 1e4  # friction of a valve that does not turn [N m]
 
 
@@ -69,9 +69,7 @@ def add_scene(
     )
     stem = plant.GetJointByName("stem", valve_model)
     # The joint's zero is the bar level; closed is at bar_angle.
-    stem.set_position_limits(
-        [valve.bar_angle - valve.stop_play], [valve.bar_angle + valve.travel + valve.stop_play]
-    )
+    stem.set_position_limits([valve.bar_angle - valve.stop_play], [valve.bar_angle + valve.travel + valve.stop_play])
     # Coulomb friction: a servo to zero speed that cannot exceed the friction torque.
     friction = plant.GetJointActuatorByName("stem", valve_model)
     friction.set_controller_gains(PdControllerGains(p=1e-4, d=1e5))

@@ -11,9 +11,9 @@ import math
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
-from pydrake.systems.controllers import InverseDynamics
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, Multiplexer
 
@@ -91,7 +91,9 @@ def _add_servos(builder: DiagramBuilder, plant: MultibodyPlant, scene: Scene, st
     fingers = [f"{side}_finger_1" for side in SIDES]
     driver = builder.AddSystem(
         ServoDriver(
-            [plant.GetJointByName(f, scene.robot).position_start() for f in fingers], plant.num_multibody_states(), start
+            [plant.GetJointByName(f, scene.robot).position_start() for f in fingers],
+            plant.num_multibody_states(),
+            start,
         )
     )
     arms = {f"{side}_arm.position_command": arm_joints(side) for side in SIDES}
@@ -153,7 +155,9 @@ class OdometrySystem(Block):
         noise = 1 + self._error.odometry_noise * _rng(self._seed, 1, count).standard_normal(2)
         forward, w = np.array([forward, w]) * self._scale * noise
         middle = h + w * TICK / 2
-        new = np.array([x + forward * TICK * np.cos(middle), y + forward * TICK * np.sin(middle), h + w * TICK, forward, w])
+        new = np.array(
+            [x + forward * TICK * np.cos(middle), y + forward * TICK * np.sin(middle), h + w * TICK, forward, w]
+        )
         return (new, count + 1), {"odometry": new}
 
 
@@ -379,9 +383,7 @@ def make_simulated_station(
     for side in SIDES:
         builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
 
-    rig = CameraRig(
-        make_mounts(head, simulation, seed), valve, marker_size, simulation.light, simulation.camera, seed
-    )
+    rig = CameraRig(make_mounts(head, simulation, seed), valve, marker_size, simulation.light, simulation.camera, seed)
     positions = builder.AddSystem(MatrixGain(np.eye(plant.num_positions(), plant.num_multibody_states())))
     positions.set_name("positions")
     builder.Connect(plant.get_state_output_port(), positions.get_input_port())
@@ -412,7 +414,12 @@ def make_simulated_station(
 
 
 def _set_start(
-    plant: MultibodyPlant, scene: Scene, simulation: SimulationConfig, start: np.ndarray, home: np.ndarray, opening: float
+    plant: MultibodyPlant,
+    scene: Scene,
+    simulation: SimulationConfig,
+    start: np.ndarray,
+    home: np.ndarray,
+    opening: float,
 ) -> None:
     """Default positions of all joints: where the run begins."""
     values = dict(zip(BASE, start))
