@@ -1,23 +1,44 @@
-"""From a log to numbers: what happened in a run. Reads nothing but the log."""
+"""From a log to numbers: what happened in a run. Reads nothing but the log (through traces.py)."""
 
 import dataclasses as dc
 import os
 
 import numpy as np
 
-from valve_drake.messages import Mode
+from valve_drake.analysis.traces import ARMS, TORSO, Estimates, ModeSpan, Traces
+from valve_drake.messages import SIDES, Mode
 from valve_drake.recording.reader import LogReader
+
+LOADED = 1.0  # couple above which the hands' shares mean something [N m]
+TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
 
 
 @dc.dataclass(frozen=True)
-class ModeSpan:
-    """One stay in a mode. `reason` is why it was entered."""
+class EstimateNumbers:
+    """Stage 2 within one mode. Errors against truth include the head's mount (traces.py); None without truth.
 
-    mode: str
-    activation: int
-    start: float  # [s]
-    end: float
-    reason: str
+    spread: scatter of the errors about their mean against the claimed covariance, as the root of the mean normalised
+    square; 1 is an honest covariance. Nothing that is constant enters it, such as the mount. None below 4 estimates.
+    """
+
+    found: int
+    distance_m: float  # median
+    position_rms_m: float | None
+    position_max_m: float | None
+    angle_rms_rad: float | None
+    sigma_position_m: float  # claimed: root mean square, all three axes together
+    sigma_angle_rad: float
+    spread: float | None
+    residual_px: float  # median
+
+
+@dc.dataclass(frozen=True)
+class TrackingNumbers:
+    """Commanded minus measured position of one joint over the whole run."""
+
+    rms_rad: float
+    max_rad: float
+    max_time_s: float
 
 
 @dc.dataclass
@@ -29,6 +50,7 @@ class Summary:
     reason: str = ""
     spans: list[ModeSpan] = dc.field(default_factory=list)
     sim_time_s: float = 0.0
+    retries: int = 0  # entries into a mode that had been entered before
     command_rad: float | None = None
     angle_hands_rad: float | None = None
     angle_camera_rad: float | None = None
@@ -38,64 +60,148 @@ class Summary:
     turn_mean_hand_force_N: float = 0.0
     turn_mean_stem_force_N: float = 0.0
     turn_peak_stem_force_N: float = 0.0
+    turn_mean_squeeze_N: float | None = None
+    turn_mean_torque_Nm: float | None = None
+    turn_peak_torque_Nm: float | None = None
+    turn_peak_moment_Nm: float | None = None  # of one hand at its grip
     turn_share_left: float | None = None  # mean, where the couple exceeds 1 N m
+    estimates: dict[str, EstimateNumbers] = dc.field(default_factory=dict)  # by mode
+    pairs_looked_at: int = 0  # image pairs
+    pairs_found: int = 0  # those in which the estimator found the marker
+    worst_estimate_time_s: float | None = None  # largest position error, without truth largest residual
+    servo_final_error_m: dict[str, float] = dc.field(default_factory=dict)  # by side, at the end of the last servo
+    servo_peak_speed_m_s: dict[str, float] = dc.field(default_factory=dict)
+    tracking: dict[str, TrackingNumbers] = dc.field(default_factory=dict)  # by joint
+    health_max_age_s: float | None = None
+    health_oldest: str = ""  # the device of that age
+    faults: list[tuple[float, str]] = dc.field(default_factory=list)  # first reported at [s]
+    selector_limited: dict[str, int] = dc.field(default_factory=dict)  # ticks, by what was limited
+    selector_refused: dict[str, int] = dc.field(default_factory=dict)
+    selector_tripped: dict[str, int] = dc.field(default_factory=dict)
 
     def mode_durations(self) -> dict[str, float]:
         """Seconds by mode, in the order of first entry."""
         out: dict[str, float] = {}
         for span in self.spans:
-            out[span.mode] = out.get(span.mode, 0.0) + span.end - span.start
+            out[span.mode] = out.get(span.mode, 0.0) + span.duration
         return out
 
 
-def summarize(log: str | os.PathLike | LogReader) -> Summary:
+def summarize(log: str | os.PathLike | LogReader | Traces) -> Summary:
     """The numbers of one log."""
-    reader = log if isinstance(log, LogReader) else LogReader(log)
-    out = Summary(sim_time_s=reader.end)
-    starts: list[tuple] = []
-    if "/supervisor/mode" in reader.topics:
-        for _, _, mode in reader.messages(["/supervisor/mode"]):
-            if not starts or starts[-1][1] != mode.activation:
-                starts.append((mode.mode, mode.activation, mode.since, mode.reason))
-            out.verdict, out.reason = mode.verdict, mode.reason
-            if mode.turn_angle:
-                out.command_rad = mode.turn_angle
-    ends = [s[2] for s in starts[1:]] + [reader.end]
-    out.spans = [ModeSpan(s[0], s[1], s[2], end, s[3]) for s, end in zip(starts, ends)]
-    if starts and starts[-1][0] in (Mode.DONE, Mode.FAILED, Mode.STOPPED):
-        out.outcome = starts[-1][0]
-    _angles(reader, out)
-    _forces(reader, out)
+    if not isinstance(log, Traces):
+        log = Traces(log if isinstance(log, LogReader) else LogReader(log))
+    out = Summary(spans=log.spans, sim_time_s=log.reader.end)
+    out.retries = sum(span.attempt > 0 for span in log.spans)
+    if log.modes:
+        out.verdict, out.reason = log.modes[-1].verdict, log.modes[-1].reason
+        asked = [mode.turn_angle for mode in log.modes if mode.turn_angle]
+        out.command_rad = asked[-1] if asked else None
+    if log.spans and log.spans[-1].mode in TERMINAL:
+        out.outcome = log.spans[-1].mode
+    out.angle_camera_rad = log.verify_angle
+    out.angle_true_rad = float(log.truth.angle[-1]) if log.truth is not None else None
+    _turning(log, out)
+    _estimates(log, out)
+    _servo(log, out)
+    _joints(log, out)
+    if log.health is not None:
+        _, devices, ages = log.health
+        out.health_max_age_s = float(ages.max())
+        out.health_oldest = devices[int(ages.max(axis=0).argmax())] if ages.max() > 0 else ""
+    out.faults = log.faults
+    if log.selector is not None:
+        did = log.selector
+        out.selector_limited, out.selector_refused, out.selector_tripped = did["limited"], did["refused"], did["tripped"]
     return out
 
 
-def _angles(reader: LogReader, out: Summary) -> None:
-    if "/kinematic_approach/status" in reader.topics:
-        verifying = {span.activation for span in out.spans if span.mode == Mode.VERIFY}
-        for _, _, status in reader.messages(["/kinematic_approach/status"]):
-            if status.activation in verifying and status.state in ("succeeded", "failed") and status.progress == 1.0:
-                out.angle_camera_rad = status.value
-    if "/truth/valve_angle" in reader.topics:
-        angles = [m.values[0] for _, _, m in reader.messages(["/truth/valve_angle"])]
-        out.angle_true_rad = angles[-1] - angles[0]
-
-
-def _forces(reader: LogReader, out: Summary) -> None:
-    if "/hybrid_rotation/turn" not in reader.topics:
+def _turning(log: Traces, out: Summary) -> None:
+    turn = log.turn
+    if turn is None:
         return
-    turning = [(s.start, s.end) for s in out.spans if s.mode == Mode.TURN]
-    rows = []
-    for _, time, turn in reader.messages(["/hybrid_rotation/turn"]):
-        hands = [float(np.linalg.norm(turn.force_left)), float(np.linalg.norm(turn.force_right))]
-        out.peak_hand_force_N = max(out.peak_hand_force_N, *hands)
-        if any(start < time <= end for start, end in turning):
-            out.angle_hands_rad = turn.angle
-            rows.append((*hands, float(np.linalg.norm(turn.stem_force)), turn.torque, turn.share_left))
-    if rows:
-        table = np.array(rows)
-        out.turn_peak_hand_force_N = float(table[:, :2].max())
-        out.turn_mean_hand_force_N = float(table[:, :2].mean())
-        out.turn_mean_stem_force_N = float(table[:, 2].mean())
-        out.turn_peak_stem_force_N = float(table[:, 2].max())
-        loaded = np.abs(table[:, 3]) > 1.0
-        out.turn_share_left = float(table[loaded, 4].mean()) if loaded.any() else None
+    hands = np.column_stack([turn["force_left"], turn["force_right"]])
+    out.peak_hand_force_N = float(hands.max())
+    at = log.inside(turn["time"], Mode.TURN)
+    if not at.any():
+        return
+    out.angle_hands_rad = float(turn["angle"][at][-1])
+    out.turn_peak_hand_force_N = float(hands[at].max())
+    out.turn_mean_hand_force_N = float(hands[at].mean())
+    out.turn_mean_stem_force_N = float(turn["stem_force"][at].mean())
+    out.turn_peak_stem_force_N = float(turn["stem_force"][at].max())
+    out.turn_mean_squeeze_N = float(turn["squeeze"][at].mean())
+    torque = np.abs(turn["torque"][at])
+    out.turn_mean_torque_Nm, out.turn_peak_torque_Nm = float(torque.mean()), float(torque.max())
+    out.turn_peak_moment_Nm = float(max(turn["moment_left"][at].max(), turn["moment_right"][at].max()))
+    loaded = torque > LOADED
+    out.turn_share_left = float(turn["share_left"][at][loaded].mean()) if loaded.any() else None
+
+
+def _estimates(log: Traces, out: Summary) -> None:
+    found = log.estimates
+    if found is None:
+        return
+    out.pairs_looked_at, out.pairs_found = found.looked, len(found.time)
+    if len(found.time) == 0:
+        return
+    errors = np.linalg.norm(found.position_error, axis=1)
+    worst = errors if np.isfinite(errors).all() else found.residual_px
+    out.worst_estimate_time_s = float(found.time[int(np.argmax(worst))])
+    for mode in dict.fromkeys(span.mode for span in log.spans):
+        at = log.inside(found.time, mode)
+        if at.any():
+            out.estimates[mode] = _estimate_numbers(found, at)
+
+
+def _estimate_numbers(found: Estimates, at: np.ndarray) -> EstimateNumbers:
+    error, sigma = found.error[at], found.sigma[at]
+    known = bool(np.isfinite(error).all())
+    position = np.linalg.norm(error[:, 3:], axis=1)
+    return EstimateNumbers(
+        found=int(at.sum()),
+        distance_m=float(np.median(found.distance[at])),
+        position_rms_m=_rms(position) if known else None,
+        position_max_m=float(position.max()) if known else None,
+        angle_rms_rad=_rms(np.linalg.norm(error[:, :3], axis=1)) if known else None,
+        sigma_position_m=_rms(np.linalg.norm(sigma[:, 3:], axis=1)),
+        sigma_angle_rad=_rms(np.linalg.norm(sigma[:, :3], axis=1)),
+        spread=_spread(error, found.covariance[at]) if known else None,
+        residual_px=float(np.median(found.residual_px[at])),
+    )
+
+
+def _spread(error: np.ndarray, covariance: np.ndarray) -> float | None:
+    if len(error) < 4:
+        return None
+    off = error - error.mean(axis=0)
+    try:
+        squares = [e @ np.linalg.solve(C, e) for e, C in zip(off, covariance)]
+    except np.linalg.LinAlgError:
+        return None
+    return float(np.sqrt(np.sum(squares) / (6 * (len(error) - 1))))
+
+
+def _servo(log: Traces, out: Summary) -> None:
+    if log.servo is None:
+        return
+    for side in SIDES:
+        out.servo_final_error_m[side] = float(log.servo[f"{side}_error"][-1])
+        if f"{side}_speed" in log.servo:
+            out.servo_peak_speed_m_s[side] = float(log.servo[f"{side}_speed"].max())
+
+
+def _joints(log: Traces, out: Summary) -> None:
+    joints = log.joints
+    if joints is None:
+        return
+    for name in (*TORSO, *(name for arm in ARMS.values() for name in arm)):
+        error = joints.error((name,))
+        error = np.abs(error[:, 0]) if error.shape[1] else error
+        if error.size and np.isfinite(error).all():
+            k = int(error.argmax())
+            out.tracking[name] = TrackingNumbers(_rms(error), float(error[k]), float(joints.time[k]))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
