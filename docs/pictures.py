@@ -67,8 +67,8 @@ def main(log: Path, folder: Path) -> None:
         # when, where from, what at, field of view [deg]
         "at_the_valve.png": (
             turn.start + 0.35 * (turn.end - turn.start),
-            axis + 1.5 * out + 1.7 * side + [0, 0, 0.55],
-            axis + 0.42 * out - [0, 0, 0.16],
+            axis + 2.05 * out + 1.05 * side + [0, 0, 0.75],
+            axis + 0.30 * out - [0, 0, 0.10],
             44,
         ),
         "approach.png": (
