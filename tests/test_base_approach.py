@@ -23,6 +23,7 @@ from valve_drake.messages import (
     StereoPosition,
     Verdict,
 )
+from valve_drake.ports import TICK
 
 DT = 1 / 64  # half the real rate: the laws do not depend on it, and the tests are quicker
 CONFIG = BaseApproachConfig()
@@ -458,7 +459,7 @@ def test_block_waits_for_a_sighting_that_is_newer_than_its_activation():
 
 def test_block_holds_its_outputs_between_updates():
     for port in ("command", "status"):
-        assert_holds_between_updates(rig(), port, slot=1)
+        assert_holds_between_updates(rig(), port, slot=1, period=2 * TICK)
 
 
 def test_block_clones_are_independent():

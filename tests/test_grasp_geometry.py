@@ -61,13 +61,13 @@ def test_turn_between_measures_what_turned_turns(angle):
     assert np.array_equal(turned(X, angle)[:, 3], X[:, 3])
 
 
-def test_turn_between_is_hardly_moved_by_small_errors_of_the_axis():
+def test_turn_between_is_not_moved_by_errors_of_the_axis():
     rng = np.random.default_rng(2)
     X = valve_at(1.0)
     for _ in range(50):
-        w = rng.normal(size=3) * [0.01, 0.01, 0]
+        w = rng.normal(size=3) * [0.1, 0.1, 0]
         seen = make(turned(X, 1.5)[:, :3] @ rotation(w), X[:, 3] + rng.normal(size=3) * 0.01)
-        assert turn_between(X, seen) == pytest.approx(1.5, abs=6e-4)
+        assert turn_between(X, seen) == pytest.approx(1.5, abs=1e-9)
 
 
 # ---------------------------------------------------------------- the grasps

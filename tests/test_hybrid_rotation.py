@@ -1,7 +1,10 @@
 """hybrid_rotation: two hands as stiff springs on a bar with dry friction. It turns as commanded, shares the load, bleeds
 forces, and tells a seized valve, an end stop and a lost grip apart."""
 
+import copy
 import dataclasses as dc
+import functools
+import math
 
 import numpy as np
 import pytest
@@ -44,6 +47,7 @@ class Bench:
 
     travel: lowest and highest angle of the valve, from where it stands at first [rad].
     spin: moment about the valve's axis beyond which pads spin on the bar [N m].
+    bar: the valve's angle at first: level is 0 [rad].
     off: standard error of the plan's position [m], and ten times that of its direction [rad].
     noise: of the wrist sensors' forces [N], and a hundredth of it of their torques [N m].
     """
@@ -54,6 +58,7 @@ class Bench:
         *,
         travel: tuple[float, float] = (-10.0, 10.0),
         spin: float = 1.0,
+        bar: float = -0.1,
         off: float = 0.002,
         seed: int = 0,
         noise: float = 0.3,
@@ -63,7 +68,7 @@ class Bench:
         self.friction, self.travel, self.spin = friction, travel, spin
         self.noise = noise
         self.bias = self.rng.normal(size=(2, 6)) * [0.1, 0.1, 0.1, 2, 2, 2]
-        self.X_HV = make(FACING @ rot_y(0.05) @ rot_z(0.1), np.array([0.66, 0.01, -0.06]))
+        self.X_HV = make(FACING @ rot_y(0.05) @ rot_z(-bar), np.array([0.66, 0.01, -0.06]))
         seen = rotation(self.rng.normal(size=3) * off * 10)
         plan = make(self.X_HV[:, :3] @ seen, self.X_HV[:, 3] + self.rng.normal(size=3) * off)
         self.plan = GraspPlan(found=True, X_BV=compose(GEOMETRY.X_BH(), plan))
@@ -84,33 +89,48 @@ class Bench:
         self.command = Command()
 
     # ------------------------------------------------------------ physics
-    def springs(self, wanted: list[np.ndarray]) -> float:
-        """Poses of the hands with the valve as it stands, and what the springs put on them -> couple on the valve."""
-        X_HV, couple = turned(self.X_HV, self.angle), 0.0
+    def springs(self, wanted: list[np.ndarray]) -> tuple[float, float, list[float]]:
+        """Poses of the hands and loads on them with the valve as it stands.
+
+        Returns the couple of the forces on the valve, its stiffness, and the moments at the pads before these spin.
+        """
+        X_HV, couple, stiffness, moments = turned(self.X_HV, self.angle), 0.0, 0.0, []
         u = -X_HV[:, 2]
         for k, Xc in enumerate(wanted):
             holds = self.held[k] is not None and not self.slips[k]
-            X = self.X[k] = compose(X_HV, self.held[k]) if holds else Xc
+            X = compose(X_HV, self.held[k]) if holds else Xc
             m = -ANGULAR * rotation_vector(Xc[:, :3] @ X[:, :3].T)
-            over = m @ u - np.clip(m @ u, -self.spin, self.spin)
-            if holds and over:  # the pads spin on the bar
-                X = self.X[k] = make(rotation(-over / ANGULAR * u) @ X[:, :3], X[:, 3])
-                self.held[k], m = compose(inverse(X_HV), X), m - over * u
             f = -STIFFNESS * (Xc[:, 3] - X[:, 3])
-            self.load[k] = *m, *f
-            couple -= u @ (m + cross(X[:, 3] - X_HV[:, 3], f))
-        return couple
+            over = m @ u - min(max(m @ u, -self.spin), self.spin)
+            if holds:
+                r = X[:, 3] - X_HV[:, 3]
+                couple -= u @ cross(r, f)
+                stiffness += STIFFNESS * (r @ r - (u @ r) ** 2)
+                moments.append(-float(m @ u))
+                X = make(rotation(-over / ANGULAR * u) @ X[:, :3], X[:, 3])
+            self.X[k], self.load[k] = X, (*(m - over * u), *f)
+        return float(couple), float(stiffness), moments
 
     def turn_valve(self) -> None:
-        stiffness = 2 * (STIFFNESS * MARKER.handle_radius**2 + ANGULAR)
+        """Dry friction: the valve turns just until the couple is down to it."""
         wanted = [GEOMETRY.arm_forward(q, side) for q, side in zip(self.q, SIDES)]
-        couple = self.springs(wanted)
-        for _ in range(3):
-            over = couple - np.clip(couple, -self.friction, self.friction)
-            if abs(over) < 1e-3:
-                break
-            self.angle = float(np.clip(self.angle + over / stiffness, *self.travel))
-            couple = self.springs(wanted)
+        couple, stiffness, moments = self.springs(wanted)
+
+        def rest(turn: float) -> float:
+            pads = [min(max(m - ANGULAR * turn, -self.spin), self.spin) for m in moments]
+            return couple - stiffness * turn + sum(pads)
+
+        goal = min(max(rest(0.0), -self.friction), self.friction)
+        if rest(0.0) != goal:
+            turn, step = 0.0, math.copysign(0.01, rest(0.0) - goal)
+            for _ in range(24):  # rest() falls with the turn
+                step /= 2
+                turn += step if (rest(turn + step) - goal) * step > 0 else 0.0
+            self.angle = min(max(self.angle + turn, self.travel[0]), self.travel[1])
+            self.springs(wanted)
+        for k in range(2):
+            if self.held[k] is not None and not self.slips[k]:
+                self.held[k] = compose(inverse(turned(self.X_HV, self.angle)), self.X[k])
 
     def close(self, k: int, wanted: float, force: float) -> None:
         opening = self.gripper[k] + np.clip(wanted - self.gripper[k], -0.15 * TICK, 0.15 * TICK)
@@ -126,9 +146,9 @@ class Bench:
     def state(self) -> RobotState:
         raw = []
         for k, side in enumerate(SIDES):
-            R = GEOMETRY.arm_forward(self.true[k], side)[:, :3]
+            R = self.X[k][:, :3]
             f, m = R.T @ self.load[k, 3:], R.T @ self.load[k, :3]
-            at_sensor = np.concatenate([m + np.cross([0, 0, GEOMETRY.grip_behind], f), f])
+            at_sensor = np.concatenate([m + cross(np.array([0, 0, GEOMETRY.grip_behind]), f), f])
             noise = self.rng.normal(size=6) * self.noise * np.array([0.01] * 3 + [1] * 3)
             raw.append(at_sensor + gravity_wrench(R, GEOMETRY, side) + self.bias[k] + noise)
         return RobotState(
@@ -160,7 +180,9 @@ class Bench:
             self.true[k] = q
         self.time += TICK
         t = self.memory.telemetry
-        self.rows.append((self.time, self.angle, t.angle, t.torque, t.share_left, *np.linalg.norm(self.load[:, 3:], axis=1)))
+        f = self.load[:, 3:]
+        forces = np.linalg.norm([*f, f.sum(axis=0)], axis=1)
+        self.rows.append((self.time, self.angle, t.angle, t.torque, t.share_left, *forces))
         return self.memory.status
 
     def run(self, mode: Mode, angle: float = 0.0, *, limit: float = 60.0, each=None) -> Status:
@@ -176,13 +198,471 @@ class Bench:
                 break
         return status
 
-    def grasp(self) -> "Bench":
-        """Stand-off (where the sensors are tared), then the grasp."""
-        self.run(Mode.REACH, limit=1.0)
-        status = self.run(Mode.GRASP)
-        assert status.state == "succeeded", status.detail
-        return self
-
     def record(self) -> np.ndarray:
-        """Columns: time, true angle, angle by the hands, torque, left share, force of the left and the right hand."""
+        """Columns: time, true angle, angle by the hands, torque, left share, forces on the left hand, the right, the stem."""
         return np.array(self.rows)
+
+
+@functools.cache
+def _grasped(spin: float, off: float, seed: int, bar: float) -> Bench:
+    bench = Bench(spin=spin, off=off, seed=seed, bar=bar)
+    bench.run(Mode.REACH, limit=1.0)
+    status = bench.run(Mode.GRASP)
+    assert status.state == "succeeded", status.detail
+    return bench
+
+
+def grasped(friction: float = 5.1, *, travel=(-10.0, 10.0), spin=1.0, off=0.002, seed=0, bar=-0.1) -> Bench:
+    """Both hands hold the bar, after a stand-off (where the sensors are tared) and the grasp."""
+    bench = copy.deepcopy(_grasped(spin, off, seed, bar))
+    bench.friction, bench.travel = friction, travel
+    return bench
+
+
+# ---------------------------------------------------------------- the turn
+
+
+@pytest.mark.parametrize("friction, turn, spin", [(5.1, QUARTER, 1.0), (7.3, QUARTER, 1.0), (5.1, -0.5, 100.0), (2.5, 0.5, 1.0)])
+def test_it_turns_as_commanded_with_both_hands_alike(friction, turn, spin):
+    bench = grasped(friction, spin=spin)
+    start = bench.angle
+    status = bench.run(Mode.TURN, turn)
+    assert status.state == "succeeded", status.detail
+    assert (status.activation, status.progress) == (3, 1.0)
+    record = bench.record()
+    moving = record[128:-64]
+    assert np.degrees(bench.angle - start - turn) == pytest.approx(0, abs=0.3)
+    assert status.value == pytest.approx(bench.angle - start, abs=np.radians(0.1))  # what the hands say is true
+    assert np.all((0.4 < moving[:, 4]) & (moving[:, 4] < 0.6))
+    assert np.abs(moving[:, 3]) == pytest.approx(np.full(len(moving), friction), abs=0.4)  # the couple, measured
+    assert record[:, 5:7].max() < 1.2 * friction / 0.3 + 3  # each carries its half of the couple, and hardly more
+    assert record[:, 7].mean() < 2.5  # on the stem beyond the couple
+    if friction == 5.1:
+        assert record[:, 5:7].max() < 22
+    assert np.degrees(np.abs(np.diff(record[:, 1])).max()) / TICK < np.degrees(CONFIG.rate) * 1.3
+    assert record[-1, 0] - record[0, 0] < abs(turn) / CONFIG.rate + 2.0
+
+
+def test_a_plan_that_is_off_by_millimetres_and_degrees_is_borne():
+    for seed in (1, 2):
+        bench = grasped(off=0.003, seed=seed, spin=100.0)
+        assert bench.run(Mode.TURN, 0.4).state == "succeeded"
+        assert np.degrees(bench.angle - 0.4) == pytest.approx(0, abs=0.3)
+        assert bench.record()[:, 5:7].max() < 35
+
+
+def test_without_the_couple_in_the_relative_target_the_hands_yield_to_it(monkeypatch):
+    """The trap that equation (5) avoids: with h_r* = squeeze b alone, a loaded valve does not turn."""
+    law = hybrid_rotation.twists
+
+    def naive(chain, rate, config, extra):
+        return law(dc.replace(chain, torque=0.0), rate, config, extra)
+
+    bench = grasped()
+    monkeypatch.setattr(hybrid_rotation, "twists", naive)
+    status = bench.run(Mode.TURN, QUARTER)
+    assert status.state == "failed"
+    assert np.degrees(bench.angle) < 5
+    bench = grasped(0.0)  # an unloaded valve hides it
+    assert bench.run(Mode.TURN, 0.2).state == "succeeded"
+
+
+def test_the_turn_is_counted_from_where_it_began():
+    """The tug and the grasp before may have moved the valve; a second turn goes on from the first."""
+    bench = grasped()
+    for k in (1, 2):
+        bench.run(Mode.TURN, 0.15)
+        assert bench.angle == pytest.approx(0.15 * k, abs=0.004)
+        assert bench.memory.telemetry.angle == pytest.approx(0.15, abs=0.002)
+
+
+# ---------------------------------------------------------------- what ends it
+
+
+@pytest.mark.parametrize("spin", [1.0, 100.0])
+def test_a_seized_valve_is_stuck_without_wind_up(spin):
+    bench = grasped(1e4, spin=spin)
+    peak = []
+    status = bench.run(Mode.TURN, QUARTER, each=lambda b: peak.append(b.load[:, 3:].copy()))
+    assert (status.state, status.verdict) == ("failed", "stuck")
+    assert "both ways" in status.detail
+    record = bench.record()
+    assert np.abs(bench.angle) < 1e-6
+    assert record[:, 5:7].max() < 60
+    waiting = record[128 : 2 * 128]  # pushing against it in the second second
+    assert np.ptp(waiting[:, 3]) < 1.0
+    assert waiting[:, 3].max() < 1.05 * CONFIG.torque_limit
+    assert np.abs(record[-1, 3]) < 1.05 * CONFIG.torque_limit
+    assert record[-1, 0] - record[0, 0] < 3 * CONFIG.stall_time  # soon
+
+
+@pytest.mark.parametrize("stop, spin", [(50, 1.0), (10, 100.0)])
+def test_a_stop_on_the_way_is_an_end_stop(stop, spin):
+    bench = grasped(travel=(-0.01, np.radians(stop)), spin=spin)
+    status = bench.run(Mode.TURN, QUARTER)
+    assert (status.state, status.verdict) == ("failed", "end_stop")
+    assert np.degrees(status.value) == pytest.approx(stop, abs=0.3)
+    assert bench.record()[:, 5:7].max() < 60
+
+
+def test_a_stop_right_at_the_start_is_an_end_stop_too():
+    """It was told to close a closed valve."""
+    bench = grasped(travel=(-0.005, 1.7))
+    status = bench.run(Mode.TURN, -QUARTER)
+    assert (status.state, status.verdict) == ("failed", "end_stop")
+    assert np.degrees(status.value) == pytest.approx(-0.3, abs=0.3)
+
+
+@pytest.mark.parametrize("hand", [0, 1])
+def test_a_hand_that_slips_is_a_slip(hand):
+    """Its pads slide along the bar: it stays closed, and the other carries all."""
+
+    def slip(bench):
+        bench.slips[hand] = bench.angle > 0.1
+
+    bench = grasped()
+    status = bench.run(Mode.TURN, QUARTER, each=slip)
+    assert (status.state, status.verdict) == ("failed", "slip")
+    share = float(status.detail.split("left hand carries ")[1].split(" ")[0])
+    assert share == pytest.approx(100.0 * hand, abs=3)
+    assert bench.angle < 0.1 + 1.5 * CONFIG.rate
+    assert bench.record()[:, 5:7].max() < 60
+
+
+@pytest.mark.parametrize("hand", [0, 1])
+def test_a_hand_that_loses_the_bar_is_a_slip(hand):
+    def lose(bench):
+        if bench.angle > 0.1:
+            bench.missing[hand], bench.held[hand] = True, None
+
+    bench = grasped(1.0)  # so little friction that the shares say nothing
+    status = bench.run(Mode.TURN, QUARTER, each=lose)
+    assert (status.state, status.verdict) == ("failed", "slip")
+    assert "openings 0.0" in status.detail if hand == 0 else "and 0.0 mm" in status.detail
+
+
+def test_a_knock_on_a_hand_trips():
+    """A load far above the trip for a few ticks, along the bar, where the valve's friction cannot have put it."""
+
+    def knock(bench):
+        if 0.1 < bench.angle:
+            bench.load[1, 3:] += [0, 250.0, 0]
+
+    bench = grasped()
+    status = bench.run(Mode.TURN, QUARTER, each=knock)
+    assert (status.state, status.verdict) == ("failed", "fault")
+    assert "hand forces" in status.detail
+
+
+@pytest.mark.parametrize("mode", [Mode.GRASP, Mode.TURN])
+def test_a_sensor_that_reports_nonsense_is_a_fault_at_once_and_the_hands_hold_still(mode):
+    bench = Bench() if mode == Mode.GRASP else grasped()
+    after = []
+
+    def fail(b):
+        if len(b.rows) > 100:
+            b.bias[0, 4] = np.nan
+            after.append(np.concatenate(b.q))
+
+    status = bench.run(mode, QUARTER, each=fail)
+    assert (status.state, status.verdict) == ("failed", "fault")
+    assert "not finite" in status.detail
+    assert len(after) <= 3
+    assert np.isfinite(after).all()
+    state = ModeState(mode=mode.value, activation=bench.activation, turn_angle=QUARTER)
+    for _ in range(10):
+        bench.tick(state)
+        assert np.array_equal(np.concatenate(bench.q), after[-1])
+    bench.bias[0, 4] = 0.0  # it comes back: the bad reports are forgotten, and the release bleeds the forces
+    status = bench.run(Mode.RELEASE)
+    assert status.state == "succeeded"
+    assert np.isfinite(bench.memory.wrenches).all()
+    assert np.linalg.norm(bench.load[:, 3:]) < 1e-6
+
+
+def test_the_end_of_reach_ends_the_turn():
+    bench = grasped(0.5, bar=1.2)
+    status = bench.run(Mode.TURN, 2 * np.pi)
+    assert (status.state, status.verdict) == ("failed", "reach_limit")
+    assert 0.3 < bench.angle < 2.0
+
+
+# ---------------------------------------------------------------- the grasp
+
+
+def test_a_grasp_is_closed_tugged_and_relaxed():
+    bench = Bench()
+    bench.run(Mode.REACH, limit=1.0)
+    stages = []
+    tug = []
+    u = -bench.X_HV[:, 2]
+
+    def watch(b):
+        stages.append(b.memory.stage)
+        tug.append(-(b.load[:, 3:] @ u))
+
+    status = bench.run(Mode.GRASP, each=watch)
+    assert status.state == "succeeded" and "25.0" in status.detail
+    assert list(dict.fromkeys(stages)) == ["close", "tug", "settle", "held"]
+    assert np.max(tug, axis=0).min() >= CONFIG.tug_force - 1  # both were pulled at
+    assert np.max(tug) < 35
+    assert np.linalg.norm(bench.load[:, 3:], axis=1).max() < 2.0  # and relaxed
+    assert abs(bench.angle) < 0.002
+    assert bench.command.left_gripper.tolist() == [0.0, CONFIG.grip_force]
+
+
+@pytest.mark.parametrize("hand", [0, 1])
+def test_a_hand_beside_the_bar_has_missed(hand):
+    bench = Bench()
+    bench.run(Mode.REACH, limit=1.0)
+    bench.missing[hand] = True
+    status = bench.run(Mode.GRASP)
+    assert (status.state, status.verdict) == ("failed", "grasp_missed")
+    assert status.time < bench.time and bench.record()[-1, 0] - bench.record()[0, 0] < CONFIG.close_time + 0.1
+    assert "0.0" in status.detail
+
+
+@pytest.mark.parametrize("hand", [0, 1])
+def test_a_hand_that_slides_off_when_tugged_has_missed(hand):
+    bench = Bench()
+    bench.run(Mode.REACH, limit=1.0)
+    bench.slips[hand] = True
+    status = bench.run(Mode.GRASP)
+    assert (status.state, status.verdict) == ("failed", "grasp_missed")
+    assert status.detail.startswith("tug")
+    assert bench.record()[:, 5:7].max() < 60
+
+
+# ---------------------------------------------------------------- the release
+
+
+@pytest.mark.parametrize("friction, after", [(7.3, 0.2), (1e4, 0.0)])
+def test_release_bleeds_the_forces_before_it_opens(friction, after):
+    bench = grasped(friction, spin=100.0)
+    bench.run(Mode.TURN, 0.2)
+    before, angle = np.linalg.norm(bench.load[:, 3:], axis=1), bench.angle
+    assert before.min() > 8
+    opened = []
+
+    def watch(b):
+        if not opened and b.command.left_gripper[0] > 0:
+            opened.append((b.time, b.load.copy(), b.X.copy()))
+
+    start = bench.time
+    status = bench.run(Mode.RELEASE, each=watch)
+    assert status.state == "succeeded"
+    time, load, X = opened[0]
+    assert time - start > CONFIG.relax
+    assert np.linalg.norm(load[:, 3:], axis=1).max() < 2.0
+    assert np.linalg.norm(load[:, :3], axis=1).max() < 0.5
+    assert bench.angle == pytest.approx(angle, abs=1e-3) and abs(bench.angle - after) < 0.01
+    for k, side in enumerate(SIDES):  # hands open, drawn back along the camera's view
+        assert bench.gripper[k] == pytest.approx(CONFIG.opening)
+        moved = X[k][:, :3].T @ (bench.X[k][:, 3] - X[k][:, 3])
+        assert moved == pytest.approx(-CONFIG.retreat * VIEW[side], abs=0.003)
+
+
+def test_hands_that_are_open_are_drawn_back_at_once():
+    """A release from servoing: nothing is held, nothing to bleed."""
+    bench = Bench()
+    bench.run(Mode.SERVO, limit=0.1)
+    status = bench.run(Mode.RELEASE)
+    assert status.state == "succeeded"
+    assert bench.record()[-1, 0] - bench.record()[0, 0] < CONFIG.retreat / CONFIG.retreat_speed + 0.1
+
+
+def test_a_release_that_follows_others_motion_starts_where_the_hands_are():
+    """A second attempt: between its own modes reach and servo moved the hands."""
+    bench = grasped()
+    bench.run(Mode.RELEASE)
+    bench.run(Mode.SERVO, limit=0.05)
+    lower = [X.copy() for X in bench.X]
+    for X in lower:
+        X[:, 3] += [0.0, 0.0, -0.05]
+    bench.q = bench.true = [GEOMETRY.arm_inverse(X, side, q) for X, side, q in zip(lower, SIDES, bench.q)]
+    bench.run(Mode.SERVO, limit=0.05)
+    q = np.concatenate(bench.true)
+    bench.run(Mode.RELEASE, limit=0.05)
+    assert np.abs(np.concatenate([bench.command.left_arm, bench.command.right_arm]) - q).max() < 0.02
+
+
+# ---------------------------------------------------------------- sensing
+
+
+@pytest.mark.parametrize("side, s", [(LEFT, 1), (RIGHT, -1)])
+def test_gravity_wrench_is_the_hands_weight_at_its_centre_of_mass(side, s):
+    weight = 9.81 * GEOMETRY.hand_mass
+    x, _, z = GEOMETRY.p_SHand
+    level = GEOMETRY.arm_forward(np.zeros(6), side)[:, :3]  # y of the hand is up
+    assert gravity_wrench(level, GEOMETRY, side) == pytest.approx([z * weight, 0, -s * x * weight, 0, -weight, 0])
+    down = np.column_stack([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # z of the hand points to the floor
+    assert gravity_wrench(down, GEOMETRY, side) == pytest.approx([0, -s * x * weight, 0, 0, 0, weight])
+
+
+def test_contact_wrench_is_moved_to_the_grip_point_and_freed_of_bias_and_weight():
+    R = GEOMETRY.arm_forward(np.array([0.4, 0.5, -1.6, 0.3, 0.9, -0.4]), LEFT)[:, :3]
+    f, m, bias = np.array([3.0, -4, 5]), np.array([0.1, 0.2, -0.3]), np.arange(6.0)
+    lever = 0.14 * R[:, 2]  # sensor to grip point
+    torque = m + np.cross(lever, f)  # at the sensor
+    raw = np.concatenate([R.T @ torque, R.T @ f]) + bias + gravity_wrench(R, GEOMETRY, LEFT)
+    assert contact_wrench(raw, bias, R, GEOMETRY, LEFT) == pytest.approx([*m, *f])
+    # by hand: a hand that points ahead is pulled to the left with 10 N at its grip point: 1.4 N m at the sensor
+    level = GEOMETRY.arm_forward(np.zeros(6), LEFT)[:, :3]
+    raw = np.array([0, 1.4, 0, 10, 0, 0]) + gravity_wrench(level, GEOMETRY, LEFT)
+    assert contact_wrench(raw, np.zeros(6), level, GEOMETRY, LEFT) == pytest.approx([0, 0, 0, 0, 10, 0], abs=1e-12)
+
+
+def test_tare_removes_the_bias():
+    bench = Bench(seed=3)
+    bench.run(Mode.REACH, limit=1.0)
+    assert bench.memory.bias == pytest.approx(bench.bias, abs=0.2)
+    assert np.abs(bench.memory.bias - bench.bias)[:, :3].max() < 0.002
+    bench.run(Mode.SERVO, limit=0.3)
+    assert np.abs(bench.memory.wrenches[:, 3:]).max() < 0.6  # N, of a bias of some N
+    assert np.abs(bench.bias[:, 3:]).max() > 2
+
+
+def test_a_moving_hand_is_not_tared_and_a_new_stand_still_starts_anew():
+    bench = Bench(seed=4, noise=0.0)
+    bench.run(Mode.REACH, limit=0.3)
+    right = bench.memory.bias
+    bench.bias = bench.bias + 1.0
+    state = ModeState(mode="reach", activation=bench.activation)
+    bench.velocity = [np.full(6, 0.1), np.zeros(6)]
+    bench.tick(state)
+    assert np.array_equal(bench.memory.bias, right)
+    bench.tick(state)
+    assert bench.memory.bias == pytest.approx(bench.bias)
+
+
+# ---------------------------------------------------------------- the equations
+
+
+def chain_with(f1=(0, 0, 0), f2=(0, 0, 0), m1=(0, 0, 0), m2=(0, 0, 0)):
+    """Hands 0.3 m apart, left hand to the left; the axis points to the robot (-x)."""
+    p = np.array([[0.6, 0.15, 0.0], [0.6, -0.15, 0.0]])
+    return make_chain(p, np.array([[*m1, *f1], [*m2, *f2]], float), np.array([-1.0, 0, 0]))
+
+
+def test_the_chain_by_hand():
+    chain = chain_with(f1=(0, 0, 17), f2=(0, 0, -17))  # a bar that resists being opened
+    assert chain.c.tolist() == [0.6, 0, 0] and chain.L == pytest.approx(0.3)
+    assert chain.b.tolist() == [0, -1, 0]
+    assert chain.t == pytest.approx([0, 0, 1])  # u x b: where hand 2 goes when the valve opens
+    assert chain.couples == pytest.approx([2.55, 2.55])
+    assert chain.torque == pytest.approx(5.1)
+    assert chain_with(m1=(0.4, 0, 0)).torque == pytest.approx(0.4)  # by the wrist alone
+
+
+def test_a_load_on_one_hand_moves_that_hand_alone():
+    """Equal to an admittance of D on each hand, as D_a = 2 D and D_r = D / 2 promise."""
+    chain = chain_with(f1=(0, 10, 0))
+    V = twists(chain, None, CONFIG, np.zeros(6))
+    p = chain.p - chain.c
+    v = [V[k, 3:] + np.cross(V[k, :3], p[k]) for k in range(2)]
+    assert v[0] == pytest.approx([0, 10 / CONFIG.damping, 0])
+    assert v[1] == pytest.approx(np.zeros(3))
+    V = twists(chain_with(m2=(0, 0, 1)), None, CONFIG, np.zeros(6))
+    assert V[0, :3] == pytest.approx(np.zeros(3)) and V[1, :3] == pytest.approx([0, 0, 1 / CONFIG.angular_damping])
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.1, -0.1])
+def test_the_driving_couple_alone_moves_nothing_but_the_turn(rate):
+    chain = chain_with(f1=(0, 0, 17), f2=(0, 0, -17))
+    V = twists(chain, rate, CONFIG, np.zeros(6))
+    for k in range(2):
+        assert V[k] == pytest.approx([-rate, 0, 0, 0, 0, 0], abs=1e-12)
+
+
+def test_a_squeeze_is_held_along_the_bar():
+    config = dc.replace(CONFIG, squeeze=8.0)
+    still = twists(chain_with(f1=(0, 8, 0), f2=(0, -8, 0)), 0.0, config, np.zeros(6))  # both pushed apart with 8 N
+    assert still == pytest.approx(np.zeros((2, 6)), abs=1e-12)
+    V = twists(chain_with(), 0.0, config, np.zeros(6))
+    assert V[0, 4] < 0 < V[1, 4]  # they press until it is so
+
+
+def test_beyond_the_torque_limit_the_target_stops_following():
+    f = 1.5 * CONFIG.torque_limit / 0.3
+    V = twists(chain_with(f1=(0, 0, f), f2=(0, 0, -f)), 0.0, CONFIG, np.zeros(6))
+    assert V[0, 5] > 0 > V[1, 5]  # the hands give way to what is too much
+
+
+def test_the_rate_ramps_brakes_and_is_scaled_by_torque_and_lead():
+    def rate(left=1.0, now=1.0, torque=0.0, lead=0.0):
+        return turn_rate(left, now, torque, lead, CONFIG, TICK)
+
+    full = CONFIG.rate
+    assert rate() == full
+    assert rate(now=0.0) == pytest.approx(full / CONFIG.ramp * TICK)
+    assert rate(now=-0.2) == rate(now=0.0)
+    assert CONFIG.slow <= rate(left=1e-4) < rate(left=0.01) < full
+    assert rate(left=0.0) == 0.0 and rate(left=-0.1) == 0.0
+    assert rate(torque=0.7 * CONFIG.torque_limit) == pytest.approx(full)
+    assert rate(torque=0.85 * CONFIG.torque_limit) == pytest.approx(full / 2)
+    assert rate(torque=CONFIG.torque_limit) == 0.0
+    assert rate(torque=CONFIG.torque_limit + 1) < 0
+    assert rate(torque=-20.0) == full  # it helps
+    assert rate(lead=CONFIG.lead_limit) == 0.0 and 0 < rate(lead=0.9 * CONFIG.lead_limit) < full
+    assert rate(lead=2 * CONFIG.lead_limit) == 0.0
+
+
+# ---------------------------------------------------------------- modes, config, block
+
+
+@pytest.mark.parametrize("mode", [m for m in Mode if m not in (Mode.GRASP, Mode.TURN, Mode.RELEASE)])
+def test_outside_its_modes_it_is_idle_and_asks_for_nothing(mode):
+    bench = Bench()
+    status = bench.run(mode, limit=2 * TICK)
+    assert status.state == "idle"
+    assert all(getattr(bench.command, f.name) is None for f in dc.fields(Command) if f.name != "time")
+
+
+def test_the_same_inputs_give_the_same_bits():
+    a, b = grasped(), Bench()
+    b.run(Mode.REACH, limit=1.0)
+    b.run(Mode.GRASP)
+    assert a.record().tobytes() == b.record().tobytes()
+
+
+@pytest.mark.parametrize(
+    "changes", [{"damping": 0.0}, {"rate": float("nan")}, {"squeeze": -1.0}, {"torque_limit": 40.0}, {"filter": -5.0}]
+)
+def test_bad_config_is_refused_by_name(changes):
+    with pytest.raises(ConfigError, match=f"hybrid_rotation.{next(iter(changes))}"):
+        HybridRotation(dc.replace(CONFIG, **changes), MARKER, GEOMETRY, VIEW)
+
+
+def rig(**inputs) -> Rig:
+    bench = Bench(noise=0.0)
+    fixed = {"robot_state": bench.state(), "mode": ModeState(mode="grasp", activation=1), "plan": bench.plan}
+    return Rig(HybridRotationSystem(bench.law), **fixed | inputs)
+
+
+def test_ports():
+    assert ports(rig().block) == {
+        "robot_state": "in abstract",
+        "mode": "in abstract",
+        "plan": "in abstract",
+        "command": "out abstract",
+        "status": "out abstract",
+        "turn": "out abstract",
+    }
+
+
+def test_block_closes_the_hands_in_grasp_and_fails_without_a_bar():
+    dut = rig().run(1.0)
+    assert dut.read("command").left_gripper[0] == 0.0
+    assert (dut.read("status").state, dut.read("turn").stage) == ("running", "close")
+    dut.run(CONFIG.close_time + 0.5)
+    assert (dut.read("status").state, dut.read("status").verdict) == ("failed", "grasp_missed")
+
+
+def test_block_holds_its_outputs_between_updates():
+    for port in ("command", "turn"):
+        assert_holds_between_updates(rig(), port, slot=1)
+
+
+def test_block_clones_are_independent():
+    change = {"mode": ModeState(mode="release", activation=2)}
+    assert_clones_are_independent(rig, change, ("command", "status", "turn"))

@@ -241,6 +241,9 @@ def test_margin_is_one_at_home_zero_at_each_limit_and_negative_beyond():
             q = HOME.copy()
             q[joint] = sign * angle
             assert GEOMETRY.arm_margin(q) == pytest.approx(0.0 if angle < ARM_LIMITS[joint] else -0.0, abs=1e-9)
+    q = HOME.copy()
+    q[0] = ARM_LIMITS[0] - np.deg2rad(10)
+    assert GEOMETRY.arm_margin(q) == pytest.approx(0.25)
     for joint in (0, 1, 3, 5):
         for past, sign in ((0.0, 0), (-0.1, 1), (0.1, -1)):
             q = HOME.copy()

@@ -62,6 +62,8 @@ def test_integers_become_floats_and_any_length_is_any_length():
 
 
 def test_an_optional_group_is_none_unless_asked_for():
+    with pytest.raises(ValueError, match="StereoPosition.p_LV"):
+        StereoPosition(p_LV=None)
     command = Command(left_arm=np.zeros(6))
     assert command.right_arm is None and command.left_arm.shape == (6,)
     with pytest.raises(ValueError, match="Command.left_arm"):

@@ -53,7 +53,7 @@ def test_every_measurement_arrives_in_its_own_field():
 def test_the_past_of_the_head_is_kept_for_half_a_second():
     dut = rig()
     for k in range(100):
-        dut.fix(**{"base.odometry": [k, 0, 0, 0, 0], "torso.position_measured": [0, k, 0]})
+        dut.fix(**{"base.odometry": [k, 0, 0, 0, 0], "torso.position_measured": [k, 2 * k, 3 * k]})
         dut.run(k * TICK + SLOT)
         state = dut.read("robot_state")
         assert state.time == k * TICK
@@ -61,7 +61,7 @@ def test_the_past_of_the_head_is_kept_for_half_a_second():
     assert HISTORY * TICK == pytest.approx(0.5)
     assert state.history[:, 0] == pytest.approx(np.arange(100 - HISTORY, 100) * TICK)
     base, torso = state.head_at(80 * TICK)
-    assert (base[0], torso[1]) == (80, 80)
+    assert base.tolist() == [80, 0, 0] and torso.tolist() == [80, 160, 240]
 
 
 def test_it_runs_first_in_a_tick_and_holds():

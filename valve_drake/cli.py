@@ -44,6 +44,8 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--command", choices=("open", "close"), dest="request", help="what to do with the valve")
     p.add_argument("--log", type=Path, help="the MCAP log (default: logs/run-<seed>.mcap)")
     p.add_argument("--meshcat", action="store_true", help="live 3D view on localhost")
+    p.add_argument("--live", action="store_true", help="serve the log's topics to Foxglove, on this machine only")
+    p.add_argument("--live-port", type=int, default=8765, metavar="PORT", help="of --live (default: 8765)")
     p.add_argument("--no-html", action="store_true", help="no 3D recording beside the log")
     p.add_argument("--no-truth", action="store_true", help="leave the simulation's truth out of the log")
     p.add_argument("--duration", type=float, metavar="SECONDS", help="end after this simulated time")
@@ -60,6 +62,22 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("scenario", nargs="?")
     p.add_argument("--out", type=Path, help="folder (default: models/taught/)")
     p.set_defaults(command=_teach)
+
+    p = commands.add_parser("review", help="one page of a log: what happened, is it whole; or of two, compared")
+    p.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="one log, or two to compare")
+    p.add_argument("--html", type=Path, metavar="FILE", help="the page (default: LOG with .review.html, beside it)")
+    p.add_argument("--json", action="store_true", help="print the same facts as one JSON object; no page unless --html")
+    p.add_argument("--export", choices=("csv", "npz"), help="write --topic as a table instead")
+    p.add_argument("--topic", help="what to export")
+    p.add_argument("--out", type=Path, metavar="FILE", help="of the export (default: beside the log)")
+    p.set_defaults(command=_review)
+
+    p = commands.add_parser("replay", help="the same blocks on what a log holds: is all as it was recorded?")
+    p.add_argument("log", type=Path)
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="another value, on the old data")
+    p.add_argument("--log", type=Path, dest="copy", metavar="FILE", help="writes what the replay makes as a log")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(command=_replay)
 
     p = commands.add_parser("recover", help="a whole log from a truncated or damaged one")
     p.add_argument("log", type=Path)
@@ -96,7 +114,7 @@ def _run(options: argparse.Namespace) -> int:
     scenario = scenarios.load(options.scenario, overrides)
     log = options.log or Path("logs") / f"run-{scenario.seed}.mcap"
     html = None if options.no_html else log.with_suffix(".html")
-    with _stopper() as stop, _display(not options.json) as show:
+    with _stopper() as stop, _live(options) as live, _display(not options.json) as show:
         result = run(
             scenario,
             log,
@@ -104,6 +122,7 @@ def _run(options: argparse.Namespace) -> int:
             meshcat_port=7000 if options.meshcat else None,
             truth=not options.no_truth,
             duration=options.duration,
+            live=live,
             show=show,
             stop=stop,
         )
@@ -142,6 +161,19 @@ def _stopper() -> Iterator[Callable[[], bool]]:
 
 
 @contextlib.contextmanager
+def _live(options: argparse.Namespace) -> Iterator[object | None]:
+    """The live view, if it is asked for."""
+    if not options.live:
+        yield None
+        return
+    from valve_drake.recording.live import LiveView
+
+    with LiveView(options.live_port) as view:
+        print(f"live at ws://127.0.0.1:{view.port} (Foxglove: open connection)", file=sys.stderr)
+        yield view
+
+
+@contextlib.contextmanager
 def _display(wanted: bool) -> Iterator[Callable]:
     """A line that shows mode, simulated time and real-time factor, on a terminal only."""
     from rich.console import Console
@@ -166,26 +198,180 @@ def _display(wanted: bool) -> Iterator[Callable]:
 
 def _print_result(result: object) -> None:
     from rich.console import Console
-    from rich.table import Table
 
     console = Console(highlight=False)
     s = result.summary
+    _print_summary(console, s)
+    factor = s.sim_time_s / max(result.wall_time, 1e-9)
+    console.print(f"{s.sim_time_s:.1f} s simulated in {result.wall_time:.1f} s (x{factor:.2f} real time)")
+    console.print(f"log {result.log}" + (f"  3D recording {result.html}" if result.html else ""))
+
+
+def _print_summary(console: object, s: object) -> None:
+    """What happened in a run: a line for each mode, the verdict, angles and forces."""
+    from rich.markup import escape
+    from rich.table import Table
+
     table = Table("mode", "start [s]", "time [s]", "why", box=None, header_style="dim")
     for span in s.spans:
-        table.add_row(span.mode, f"{span.start:.2f}", f"{span.end - span.start:.2f}", span.reason)
+        retry = f" (retry {span.attempt})" if span.attempt else ""
+        table.add_row(span.mode + retry, f"{span.start:.2f}", f"{span.duration:.2f}", escape(span.reason))
     console.print(table)
     color = "green" if s.outcome == "done" else "red"
-    console.print(f"[bold {color}]{s.outcome or 'unfinished'}[/]  verdict [bold]{s.verdict or '-'}[/]  {s.reason}")
+    console.print(f"[bold {color}]{s.outcome or 'unfinished'}[/]  verdict [bold]{s.verdict or '-'}[/]  {escape(s.reason)}")
     angles = {"commanded": s.command_rad, "camera": s.angle_camera_rad, "hands": s.angle_hands_rad, "true": s.angle_true_rad}
-    console.print("turned: " + "  ".join(f"{k} {math.degrees(v):.2f} deg" for k, v in angles.items() if v is not None))
+    known = [f"{k} {round(math.degrees(v), 2) + 0.0:.2f} deg" for k, v in angles.items() if v is not None]
+    if known:
+        console.print("turned: " + "  ".join(known))
     if s.turn_peak_hand_force_N:
         console.print(
             f"while turning: peak {s.turn_peak_hand_force_N:.1f} N a hand, mean {s.turn_mean_hand_force_N:.1f} N, "
             f"stem beyond the couple {s.turn_mean_stem_force_N:.1f} N mean"
         )
-    factor = s.sim_time_s / max(result.wall_time, 1e-9)
-    console.print(f"{s.sim_time_s:.1f} s simulated in {result.wall_time:.1f} s (x{factor:.2f} real time)")
-    console.print(f"log {result.log}" + (f"  3D recording {result.html}" if result.html else ""))
+
+
+# ---------------------------------------------------------------- review
+
+
+def _review(options: argparse.Namespace) -> int:
+    from valve_drake.analysis import report
+
+    if len(options.logs) > 2:
+        raise ConfigError(f"review takes one log or two, got {len(options.logs)}")
+    if options.export or options.topic or options.out:
+        return _export(options)
+    found = [report.review(log) for log in options.logs]
+    if len(found) == 1:
+        subject, facts, page, name = found[0], report.facts, report.page, options.logs[0].stem
+    else:
+        subject, facts, page = report.compare(*found), report.comparison_facts, report.comparison_page
+        name = "-".join(log.stem for log in options.logs)
+    html = options.html or (None if options.json else options.logs[0].with_name(f"{name}.review.html"))
+    if html is not None:
+        _keep_apart("--html", html, options.logs)
+        try:
+            html.write_text(page(subject, html.parent.resolve()), encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"{html} cannot be written: {error.strerror}") from None
+    if options.json:
+        print(json.dumps(facts(subject) | {"html": str(html) if html else None}))
+    else:
+        _print_review(found, subject)
+        print(f"page {html}")
+    return OK if all(one.integrity.sound for one in found) else DAMAGED
+
+
+def _keep_apart(option: str, path: Path, logs: Sequence[Path]) -> None:
+    if path.resolve() in [log.resolve() for log in logs]:
+        raise ConfigError(f"{option} must be another file than the log, got {path}")
+
+
+def _print_review(found: list, subject: object) -> None:
+    from rich.console import Console
+
+    from valve_drake.analysis.report import parting_values
+
+    console = Console(highlight=False, soft_wrap=True)
+    for one in found:
+        if len(found) > 1:
+            console.print(f"{one.log.path}:", markup=False)
+        _print_summary(console, one.summary)
+        for line in one.integrity.troubles:
+            console.print(f"damaged: {line}", markup=False)
+        for row in one.integrity.late[:10]:
+            missing = sum(gap.missing for gap in row.gaps)
+            console.print(f"gaps: {row.topic} {len(row.gaps)}, {missing} messages missing", markup=False)
+        whole = "whole" if one.integrity.sound else "not whole"
+        console.print(f"the log is {whole}: {one.integrity.messages} messages, {len(one.integrity.topics)} topics")
+    if len(found) == 1:
+        return
+    first = subject.first
+    if first is None:
+        console.print(f"{'[bold green]identical[/]' if subject.sound else 'no difference'}: what both hold is equal to the bit")
+        return
+    a, b = parting_values(first)
+    words = f"{first.field}: {a} and {b}" if first.field else f"only in {found[0 if b is None else 1].log.path}"
+    console.print(f"they part at t = {first.time:.6f} s, {first.topic} {words}", markup=False)
+
+
+def _export(options: argparse.Namespace) -> int:
+    from valve_drake.analysis import export
+    from valve_drake.recording.reader import LogReader
+
+    if not (options.export and options.topic):
+        raise ConfigError("an export wants both --export csv|npz and --topic")
+    if len(options.logs) != 1:
+        raise ConfigError(f"an export is of one log, got {len(options.logs)}")
+    log = LogReader(options.logs[0])
+    name = f"{options.logs[0].stem}{options.topic.replace('/', '.')}.{options.export}"
+    out = options.out or options.logs[0].with_name(name)
+    _keep_apart("--out", out, options.logs)
+    count = export.write(log, options.topic, options.export, out)
+    if options.json:
+        print(json.dumps({"topic": options.topic, "messages": count, "out": str(out), "damage": log.damage}))
+    else:
+        print(f"{out}: {count} messages of {options.topic}")
+        for line in log.damage:
+            print(f"  {line}")
+    return DAMAGED if log.damage else OK
+
+
+# ---------------------------------------------------------------- replay
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from valve_drake.recording.reader import LogReader
+    from valve_drake.recording.writer import LogError
+    from valve_drake.runner import replay
+
+    log = LogReader(options.log)
+    try:
+        with _display(not options.json) as show:
+            result = replay(log, options.set, copy=options.copy, show=show)
+    except LogError as error:
+        print(f"valve-drake: {error}", file=sys.stderr)
+        return FAILED
+    except ConfigError as error:
+        if not log.damage:
+            raise
+        print(f"valve-drake: {error} ({log.damage[0]})", file=sys.stderr)
+        return DAMAGED
+    if options.json:
+        print(json.dumps(result.as_json()))
+    else:
+        _print_replay(result)
+    if result.damage:
+        return DAMAGED
+    return OK if result.comparison.identical or options.set else FAILED
+
+
+def _print_replay(result: object) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console, found = Console(highlight=False, soft_wrap=True), result.comparison
+    console.width = max(console.width, 120)  # of the table, also in a pipe
+    for line in (*(f"damaged log: {line}" for line in result.damage), *(f"note: {note}" for note in result.notes)):
+        console.print(line, markup=False)
+    total = sum(topic.replayed for topic in found.topics.values())
+    console.print(
+        f"{result.end:.1f} s replayed in {result.wall_time:.1f} s (x{result.real_time_factor:.1f} real time), "
+        f"{total} messages of {len(found.topics)} topics"
+    )
+    if found.identical:
+        console.print("[bold green]identical[/] to the recorded ones, to the bit")
+        return
+    console.print(f"[bold red]different[/] from t = {found.first.time:.4f} s:", end=" ")
+    console.print(str(found.first), markup=False)
+    columns = ("topic", "recorded", "replayed", "equal", "first [s]", "largest difference")
+    table = Table(*columns, box=None, header_style="dim")
+    for name, topic in found.topics.items():
+        if not topic.identical:
+            counts = (str(n) for n in (topic.recorded, topic.replayed, topic.equal))
+            largest = f"{topic.max_difference:.3g} {topic.largest.field}" if topic.largest else ""
+            table.add_row(name, *counts, f"{topic.first.time:.3f}", escape(largest))
+    console.print(table)
 
 
 # ---------------------------------------------------------------- others

@@ -22,6 +22,7 @@ from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSys
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import load_head
+from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, make
 from valve_drake.kinematics import GEOMETRY
@@ -35,6 +36,7 @@ from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.robot_state_system import RobotStateSystem
 from valve_drake.scenario import Scenario
 from valve_drake.stations.contract import CONTRACT
+from valve_drake.stations.replay import Recording, make_replay_station
 from valve_drake.stations.simulated import make_simulated_station
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
 from valve_drake.supervisor.supervisor import BEHAVIORS
@@ -111,8 +113,12 @@ def initial_commands(scenario: Scenario) -> dict[str, np.ndarray]:
     return out
 
 
-def make_station(scenario: Scenario, meshcat: Meshcat | None = None) -> Diagram:
-    """The station that a resolved scenario names."""
+def make_station(scenario: Scenario, meshcat: Meshcat | None = None, recording: Recording | None = None) -> Diagram:
+    """The station that a resolved scenario names; `replay` shows a recording."""
+    if scenario.station == "replay":
+        if recording is None:
+            raise ConfigError("station replay needs a log: valve-drake replay LOG")
+        return make_replay_station(recording)
     return make_simulated_station(
         scenario.simulation,
         tuple(scenario.marker.size),
@@ -159,11 +165,15 @@ def make_diagram(
     recorder: RecorderSystem | None = None,
     *,
     meshcat: Meshcat | None = None,
+    recording: Recording | None = None,
     truth: bool = True,
 ) -> System:
-    """The whole system for a resolved scenario. truth=False leaves the recorder without the `truth.*` ports."""
+    """The whole system for a resolved scenario; `recording` is what station `replay` shows.
+
+    truth=False leaves the recorder without the `truth.*` ports.
+    """
     builder = DiagramBuilder()
-    station = builder.AddSystem(make_station(scenario, meshcat))
+    station = builder.AddSystem(make_station(scenario, meshcat, recording))
     station.set_name("station")  # whichever it is: the wiring is the same
     blocks = {block.get_name(): block for block in make_blocks(scenario)}
     for block in blocks.values():

@@ -8,7 +8,8 @@ Arm (both sides alike, lateral offset mirrored; at zero it points straight forwa
 
 Inverse (X_HG given): wrist centre w = p_HG - hand z_G - p_HS;  q1 = atan2(-w_z, w_x) turns the plane onto it;
 in the plane (x', y') = (hypot(w_x, w_z), w_y) the two links are a plane triangle:
-cos q3 = (x'^2 + y'^2 - l1^2 - l2^2) / (2 l1 l2), elbow out;  then R_x(q4) R_z(q5) R_x(q6) = (R_y(q1) R_z(q2 + q3))^T R_HG R_G0^T.
+cos q3 = (x'^2 + y'^2 - l1^2 - l2^2) / (2 l1 l2), elbow out;
+then R_x(q4) R_z(q5) R_x(q6) = (R_y(q1) R_z(q2 + q3))^T R_HG R_G0^T.
 
 Frames: frames.py. The numbers below are those of models/robot/robot.sdf; a test holds them to the file.
 """

@@ -1,4 +1,7 @@
-"""One run of the system: build it, advance it until the supervisor has ended, log everything, say what happened."""
+"""One run of the system: build it, advance it until the supervisor has ended, log everything, say what happened.
+
+`replay` runs the same diagram once more on what a log holds, and compares.
+"""
 
 import contextlib
 import dataclasses as dc
@@ -7,7 +10,7 @@ import json
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -16,22 +19,27 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
 from valve_drake import resources
+from valve_drake.analysis.comparison import Comparison
 from valve_drake.analysis.metrics import Summary, summarize
 from valve_drake.camera.lens import load_head
+from valve_drake.checks import ConfigError, require
 from valve_drake.diagram import System, command, make_diagram
 from valve_drake.messages import Mode, ModeState, OperatorCommand
-from valve_drake.ports import profile
+from valve_drake.ports import TICK, profile
 from valve_drake.recording import layout
 from valve_drake.recording.container import active
-from valve_drake.recording.recorder_system import RecorderSystem
+from valve_drake.recording.reader import LogReader
+from valve_drake.recording.recorder_system import RecorderSystem, Sink, Tee
 from valve_drake.recording.robot_frames import RobotFrames, pinholes
 from valve_drake.recording.signals import signals
 from valve_drake.recording.writer import LogError, LogWriter
-from valve_drake.scenario import Scenario, dump, resolve
+from valve_drake.scenario import Scenario, dump, parse, resolve, with_overrides
+from valve_drake.stations.replay import Recording
 
 STEP = 1 / 32  # between two looks at the mode [s]
 TAIL = 1.5  # recorded after the end: a stopped base takes a second to stand [s]
 TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
+RECORDED = ("seed", "station", "command", "angle", "time_limit", "simulation")  # keys that a replay cannot change
 
 
 @dc.dataclass(frozen=True)
@@ -101,11 +109,11 @@ def versions() -> dict[str, str]:
     return out
 
 
-def make_recorder(writer: LogWriter, scenario: Scenario) -> RecorderSystem:
+def make_recorder(sink: Sink, scenario: Scenario) -> RecorderSystem:
     """The recorder with all topics of the program."""
     head = load_head(resources.find(scenario.head_calibration, resources.models()))
     frames = RobotFrames(head, scenario.marker)
-    return RecorderSystem(writer, signals(frames, frames.scene, pinholes(head)))
+    return RecorderSystem(sink, signals(frames, frames.scene, pinholes(head)))
 
 
 def run(
@@ -116,28 +124,29 @@ def run(
     meshcat_port: int | None = None,
     truth: bool = True,
     duration: float | None = None,
+    live: Sink | None = None,
     show: Callable[[Progress], None] = lambda progress: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Result:
     """Runs a scenario (distributions and all) and writes its log.
 
     html: where to put the 3D recording. meshcat_port: also serve it live there. truth: record the truth ports.
-    duration: stop then, whatever the mode [s]. show: called every STEP. stop: True makes the operator's stop.
+    duration: stop then, whatever the mode [s]. live: also gets all that is logged. show: called every STEP. stop: True makes the operator's stop.
     """
     scenario = resolve(scenario)
     scenario.check()
+    require(scenario.station != "replay", "station", "one that runs (a log is replayed by `replay LOG`)", "replay")
     cv2.setNumThreads(1)  # the same bits on any machine, and the renderer wants the cores
     meshcat = None
     if html is not None or meshcat_port is not None:
         meshcat = Meshcat(MeshcatParams(host="localhost", port=meshcat_port))
+        meshcat.SetCameraPose(np.array([-3.0, -2.6, 2.3]), np.array([-0.6, 0.0, 0.9]))
     profile.seconds.clear()
     writer = LogWriter(log)
     with _log_kept(writer):
-        writer.write_metadata(
-            "run", {"scenario": dump(scenario), "seed": str(scenario.seed), "station": scenario.station, **versions()}
-        )
-        writer.attach(layout.NAME, layout.MEDIA_TYPE, json.dumps(layout.layout(), indent=1).encode())
-        system = make_diagram(scenario, make_recorder(writer, scenario), meshcat=meshcat, truth=truth)
+        _begin_log(writer, scenario)
+        sink = writer if live is None else Tee(writer, live)
+        system = make_diagram(scenario, make_recorder(sink, scenario), meshcat=meshcat, truth=truth)
         simulator = Simulator(system.diagram)
         if html is not None:
             meshcat.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat_port is not None)
@@ -153,6 +162,13 @@ def run(
     shares["physics"] = 1.0 - sum(shares.values())
     written = log if not writer.error else active(log)
     return Result(summarize(written), wall, written, html, writer.error, shares)
+
+
+def _begin_log(writer: LogWriter, scenario: Scenario, **facts: str) -> None:
+    """What every log begins with."""
+    about = {"scenario": dump(scenario), "seed": str(scenario.seed), "station": scenario.station}
+    writer.write_metadata("run", about | versions() | facts)
+    writer.attach(layout.NAME, layout.MEDIA_TYPE, json.dumps(layout.layout(), indent=1).encode())
 
 
 @contextlib.contextmanager
@@ -203,3 +219,128 @@ def _result_metadata(mode: ModeState, sim_time: float) -> dict[str, str]:
         "reason": mode.reason,
         "sim_time_s": repr(float(np.round(sim_time, 9))),
     }
+
+
+# ---------------------------------------------------------------- replay
+
+
+@dc.dataclass(frozen=True)
+class Replay:
+    """What came out of a replay."""
+
+    comparison: Comparison
+    end: float  # of the log, or of what could be replayed of it [s]
+    wall_time: float  # [s]
+    damage: list[str]  # of the log, in lines
+    notes: list[str]  # what may explain a difference
+
+    @property
+    def real_time_factor(self) -> float:
+        return self.end / max(self.wall_time, 1e-9)
+
+    def as_json(self) -> dict:
+        """The object of `replay --json`."""
+        found = self.comparison
+        return {
+            "identical": found.identical,
+            "replayed_s": self.end,
+            "wall_time_s": self.wall_time,
+            "real_time_factor": self.real_time_factor,
+            "topics_compared": len(found.topics),
+            "messages_compared": sum(max(topic.recorded, topic.replayed) for topic in found.topics.values()),
+            "first_divergence": found.first and found.first.as_json(),
+            "max_difference": found.max_difference,
+            "differences": {
+                name: {
+                    "recorded": topic.recorded,
+                    "replayed": topic.replayed,
+                    "equal": topic.equal,
+                    "max_difference": topic.max_difference,
+                    "first": topic.first and topic.first.as_json(),
+                    "largest": topic.largest and topic.largest.as_json(),
+                }
+                for name, topic in found.topics.items()
+                if not topic.identical
+            },
+            "damage": self.damage,
+            "notes": self.notes,
+        }
+
+
+def replay(
+    log: LogReader,
+    overrides: Sequence[str] = (),
+    *,
+    copy: Path | None = None,
+    show: Callable[[Progress], None] = lambda progress: None,
+) -> Replay:
+    """Runs all blocks on what the log's station showed them, and compares what comes out with what was recorded.
+
+    overrides: other values of the log's scenario, as `key=value`. copy: writes the replay's own log there.
+    Raises ConfigError if this version of the program cannot replay the log, LogError if `copy` cannot be written.
+    """
+    recorded = _recorded_scenario(log)
+    for key in (override.partition("=")[0].strip() for override in overrides):
+        if key.partition(".")[0] in RECORDED:
+            raise ConfigError(f"--set {key}: it is recorded; a replay can change the blocks' keys only")
+    scenario = with_overrides(dc.replace(recorded, station="replay"), overrides)
+    recording = Recording(log)
+    cv2.setNumThreads(1)  # as in the run
+    comparison = Comparison(log, recording.end)
+    with contextlib.ExitStack() as stack:
+        sink: Sink = comparison
+        writer = None
+        if copy is not None:
+            require(copy.resolve() != log.path.resolve(), "--log", "another file than the log itself", str(copy))
+            writer = stack.enter_context(LogWriter(copy))
+            _begin_log(writer, scenario, replay_of=log.path.name)
+            sink = Tee(comparison, writer)
+        system = make_diagram(scenario, make_recorder(sink, scenario), recording=recording)
+        begin = time.perf_counter()
+        mode = _feed(system, Simulator(system.diagram), recording, show, begin)
+        comparison.finish()
+        wall = time.perf_counter() - begin
+        if writer is not None:
+            writer.write_metadata("result", _result_metadata(mode, recording.end))
+    return Replay(comparison, recording.end, wall, log.damage, _notes(log, recorded, recording))
+
+
+def _recorded_scenario(log: LogReader) -> Scenario:
+    text = log.metadata.get("run", {}).get("scenario")
+    if text is None:
+        raise ConfigError(f"{log.path} cannot be replayed: it does not hold its scenario")
+    return parse(text, str(log.path))
+
+
+def _feed(
+    system: System, simulator: Simulator, recording: Recording, show: Callable[[Progress], None], begin: float
+) -> ModeState:
+    """Advances to the recording's end; the operator asks when he did in the run (stations/replay.py)."""
+    context = simulator.get_mutable_context()
+    port = system.supervisor.GetOutputPort("mode")
+    inner = system.supervisor.GetMyContextFromRoot(context)
+
+    def advance(until: float) -> None:
+        while (now := context.get_time()) < until:
+            simulator.AdvanceTo(min(now + STEP, until))
+            show(Progress(port.Eval(inner), context.get_time(), time.perf_counter() - begin))
+
+    requests = list(zip(recording.requests.times, recording.requests.values))
+    command(system, context, requests[0][1])
+    simulator.Initialize()
+    for when, request in requests[1:]:
+        advance(min(when - TICK, recording.end))
+        command(system, context, request)
+    advance(recording.end)
+    return port.Eval(inner)
+
+
+def _notes(log: LogReader, recorded: Scenario, recording: Recording) -> list[str]:
+    """What is not as it was when the log was written, and what of it is not replayed."""
+    facts, now = log.metadata["run"], versions()
+    notes = [f"{name} was {facts[name]}, is {now[name]}" for name in now if facts.get(name, now[name]) != now[name]]
+    if dump(recorded) != facts["scenario"]:
+        notes.append("the log's scenario lacks keys of this program: their defaults stand in")
+    if recording.end < log.end:
+        notes.append(f"replayed up to t = {recording.end:.3f} s: after that the log is incomplete")
+    return notes

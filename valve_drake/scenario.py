@@ -36,6 +36,7 @@ from valve_drake.supervisor.supervisor import SupervisorConfig
 
 PLATE = 0.15  # the valve's face that carries the marker, square [m]
 DEFAULT = "simulated.scenario.yaml"
+STATIONS = ("simulated", "replay")
 
 
 @dc.dataclass
@@ -68,7 +69,7 @@ class Scenario:
     def check(self) -> None:
         """Raises ConfigError that names the key, the rule and the value."""
         require(0 <= self.seed < 2**31, "seed", "within [0, 2^31)", self.seed)
-        require(self.station in ("simulated",), "station", "simulated", self.station)
+        require(self.station in STATIONS, "station", " or ".join(STATIONS), self.station)
         require(self.command in ("open", "close"), "command", "open or close", self.command)
         require_in(self.angle, 0.01, 6.29, "angle")
         require_in(self.time_limit, 0.1, 3600.0, "time_limit")
@@ -90,7 +91,11 @@ def load(path: str | None = None, overrides: typing.Sequence[str] = ()) -> Scena
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file.name}: cannot be read ({type(error).__name__})") from error
-    scenario = parse(text, file.name)
+    return with_overrides(parse(text, file.name), overrides)
+
+
+def with_overrides(scenario: Scenario, overrides: typing.Sequence[str]) -> Scenario:
+    """The scenario with `key=value` overrides, checked. Raises ConfigError as `load` does."""
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or not key:

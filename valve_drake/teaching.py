@@ -1,6 +1,6 @@
 """`valve-drake teach`: the reference image of each hand at its handle, and the image Jacobian by small moves there.
 
-On the simulated robot: both hands are put on the handles of a valve that stands straight before the robot, gripper open, and
+On the simulated robot: both hands are put on the handles of a valve that stands straight before it, gripper open, and
 moved by +-20 mm along each axis of the hand. Only images are kept: features, Jacobian, reference pictures.
 """
 
@@ -91,7 +91,7 @@ def write(scenario: Scenario, folder: Path) -> None:
         taught,
         folder / "hands.yaml",
         "Made by `valve-drake teach`. For each hand at its handle, gripper open: feature (u, v, 1)/sqrt(area),\n"
-        "image Jacobian d feature / d hand translation [1/m] in the hand's frame, area [px^2] and corners [px] of the mark.",
+        "image Jacobian d feature / d hand translation [1/m] in the hand's frame, area [px^2], corners [px] of the mark.",
     )
     for side, picture in pictures.items():
         cv2.imwrite(str(folder / f"{side}.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

@@ -5,12 +5,13 @@ import os
 
 import numpy as np
 
-from valve_drake.analysis.traces import ARMS, TORSO, Estimates, ModeSpan, Traces
+from valve_drake.analysis.traces import ARMS, Estimates, ModeSpan, Traces
 from valve_drake.messages import SIDES, Mode
 from valve_drake.recording.reader import LogReader
+from valve_drake.recording.signals import TORSO
+from valve_drake.supervisor.supervisor import TERMINAL
 
 LOADED = 1.0  # couple above which the hands' shares mean something [N m]
-TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
 
 
 @dc.dataclass(frozen=True)

@@ -4,13 +4,13 @@ from typing import Any
 
 from valve_drake.behaviors.base_approach import BaseApproachConfig, Memory, step
 from valve_drake.messages import Command, ModeState, RectangleEstimate, RobotState, Stance, Status, StereoPosition
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import TICK, Block, Inputs
 
 NO_POSITION, NO_ESTIMATE, NO_STANCE = StereoPosition(), RectangleEstimate(), Stance()
 
 
 class BaseApproachSystem(Block):
-    """Driving to the valve and back; 1/128 s, slot 1.
+    """Driving to the valve and back; 1/64 s (wheels and neck need no more), slot 1.
 
     | port | dir | type |
     |---|---|---|
@@ -35,7 +35,7 @@ class BaseApproachSystem(Block):
     def __init__(self, config: BaseApproachConfig, name: str = "base_approach"):
         config.check()
         self.config = config
-        super().__init__(name)
+        super().__init__(name, period=2 * TICK)
 
     def initial(self) -> Memory:
         return Memory()

@@ -19,11 +19,12 @@ from valve_drake.perception.marker import Marker
 class StanceConfig:
     """Scenario key `stance`: which places to stand at are tried."""
 
-    distance_min: float = 0.64  # shoulder axis to the panel's axis point, along the floor [m]
+    distance_min: float = 0.70  # shoulder axis to the panel's axis point, along the floor [m]
     distance_max: float = 0.84
     distance_step: float = 0.02
     standoff: float = 0.12  # hands start and end this far from the grasp, against the wrist camera's view [m]
-    arc_step: float = 0.1745  # [rad]
+    arc_step: float = 0.27  # between two poses of the turn that are tried [rad]
+    margin_enough: float = 0.9  # an arm margin with which the search for a better stance ends
     margin_min: float = 0.15  # least arm margin that is accepted (1 is comfortable)
 
     def check(self) -> None:
@@ -124,7 +125,8 @@ def find_stance(
     config: StanceConfig,
     view: dict[str, np.ndarray],
 ) -> tuple[np.ndarray, float]:
-    """The base pose (x, y, heading) in O, square to the panel, with the largest arm margin over the whole turn.
+    """The nearest base pose (x, y, heading) in O, square to the panel, with a comfortable arm margin over the whole
+    turn; if there is none, the one with the largest margin.
 
     Returns (base (3,), margin); margin < 0 where no stance serves.
     """
@@ -139,4 +141,6 @@ def find_stance(
         arc = best_arc(X_BV, turn_angle, geometry, marker, config, view)
         if arc.margin > margin:
             best, margin = base, arc.margin
+        if margin >= config.margin_enough:
+            break
     return best, margin

@@ -14,8 +14,9 @@ hand 1 left, 2 right; b from hand 1 to 2, t = u x b, L their distance, tau the c
 D_r = D / 2 give each hand the same damping D. The term of (5) in tau is not optional: the two driving forces are
 themselves a relative wrench, and a constant h_r* would make the hands yield to the couple that they should apply.
 
-There is no integrator on the turn: the rate is scaled down as the torque nears its limit, so a stuck valve never
-winds up energy. The joints get positions only; feeding the admittance's velocity forward makes the loop oscillate.
+There is no integrator on the turn: the rate is scaled down as the torque nears its limit, and beyond it the turn
+yields as all other directions do, so a stuck valve never winds up energy. The joints get positions only; feeding the
+admittance's velocity forward makes the loop oscillate.
 
 All vectors are in the chest frame H, which stands still while the hands are on the valve.
 """
@@ -153,15 +154,17 @@ def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, 
 def turn_rate(left: float, rate: float, torque: float, lead: float, config: HybridRotationConfig, dt: float) -> float:
     """The rate for the next tick, all along the sense of the turn (positive = towards the goal).
 
-    left: still to turn [rad]; rate: now; torque, lead: see the config's limits.
+    left: still to turn [rad]; rate: now; torque, lead: see the config's limits. Negative: yields to too much torque.
     """
+    if torque > config.torque_limit:
+        return (config.torque_limit - torque) / (2 * config.angular_damping)
     acceleration = config.rate / config.ramp
     brake = np.sqrt(2 * acceleration * max(left, 0.0))
     wanted = max(config.slow, min(config.rate, brake)) if left > 0 else 0.0
     by_torque = (config.torque_limit - torque) / (0.3 * config.torque_limit)
     by_lead = (config.lead_limit - lead) / (0.25 * config.lead_limit)
     scaled = wanted * float(np.clip(min(by_torque, by_lead), 0.0, 1.0))
-    return min(scaled, rate + acceleration * dt)
+    return min(scaled, max(rate, 0.0) + acceleration * dt)
 
 
 @dc.dataclass(frozen=True)
@@ -221,9 +224,14 @@ class HybridRotation:
         chain = make_chain(p, m.wrenches, u)
         if mode.activation != m.activation:
             m = self._begin(time, m, mode, X, q, chain)
-        m = self._angle(m, chain)
+        sound = bool(np.all(np.isfinite(chain.h)))
+        if sound:
+            m = self._angle(m, chain)
+        elif mode.mode != Mode.RELEASE and m.status.state == "running":
+            m = self._fail(time, m, Verdict.FAULT, "a wrist sensor's or arm's report is not finite")
         run = {Mode.GRASP: self._grasp, Mode.TURN: self._turn, Mode.RELEASE: self._release}[Mode(mode.mode)]
         m, V, gripper = run(time, dt, m, state, mode, chain)
+        V = V if sound else np.zeros((2, 6))
         m = self._move(dt, m, V, chain)
         m = dc.replace(m, telemetry=self._telemetry(time, m, chain))
         command = Command(
@@ -237,7 +245,7 @@ class HybridRotation:
         raw = (state.left_wrench, state.right_wrench)
         if mode.mode == Mode.REACH:
             still = max(np.max(np.abs(state.left_arm_velocity)), np.max(np.abs(state.right_arm_velocity))) < 0.02
-            if not still:
+            if not still or not np.all(np.isfinite(raw)):
                 return dc.replace(m, tared=False) if m.tared else m
             load = np.array(
                 [raw[k] - gravity_wrench(X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)]
@@ -249,7 +257,8 @@ class HybridRotation:
             [contact_wrench(raw[k], m.bias[k], X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)]
         )
         a = 1 - np.exp(-2 * np.pi * self.config.filter * dt)
-        return dc.replace(m, wrenches=m.wrenches + a * (now - m.wrenches))
+        last = np.where(np.isfinite(m.wrenches), m.wrenches, now)  # one bad report must not stay in the filter
+        return dc.replace(m, wrenches=last + a * (now - last))
 
     def _begin(self, time: float, m: Memory, mode: ModeState, X: tuple, q: tuple, chain: Chain) -> Memory:
         stage = {Mode.GRASP: "close", Mode.TURN: "turn", Mode.RELEASE: "relax"}[Mode(mode.mode)]

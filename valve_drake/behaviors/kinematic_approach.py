@@ -28,7 +28,7 @@ from valve_drake.behaviors.grasp_geometry import (
 from valve_drake.behaviors.joint_path import Path, find_path
 from valve_drake.checks import require, require_positive
 from valve_drake.frames import compose, inverse, planar, wrap
-from valve_drake.kinematics import RobotGeometry, lateral
+from valve_drake.kinematics import ARM_LIMITS, RobotGeometry, lateral
 from valve_drake.messages import (
     LEFT,
     RIGHT,
@@ -62,7 +62,7 @@ class KinematicApproachConfig:
     mark_ratio: float = 0.9  # sqrt(area) of the green mark over the taught one at which reaching ends
     opening: float = 0.085  # gripper open [m]
     gripper_force: float = 40.0  # while opening [N]
-    stance_period: float = 0.5  # between two searches for the stance [s]
+    stance_period: float = 1.0  # between two searches for the stance [s]
     angle_tolerance: float = 0.035  # camera angle against the command that counts as turned [rad]
 
     def check(self) -> None:
@@ -176,7 +176,10 @@ class KinematicApproach:
         """Plans a path from the present command to `goal`; phase "moving", or "blocked" if there is none."""
         if np.max(np.abs(goal - m.q)) < 1e-6:
             return dc.replace(m, phase="moving", path=None, since=time)
-        points = find_path(m.q, goal, self._vias(m.q, goal, X_BV), lambda q: self.is_free(X_BV, q))
+        limits = np.tile(ARM_LIMITS, 2)
+        points = find_path(
+            m.q, goal, self._vias(m.q, goal, X_BV), lambda q: bool(np.all(np.abs(q) <= limits)) and self.is_free(X_BV, q)
+        )
         if points is None:
             return dc.replace(m, phase="blocked", path=None, since=time)
         path = Path(points, time, self.config.joint_speed, self.config.joint_acceleration)
@@ -217,7 +220,7 @@ class KinematicApproach:
         )
         good = margin >= self.stance.margin_min
         reason = "" if good else f"no stance holds both handles through the turn (margin {margin:.2f})"
-        return dc.replace(m, stance=Stance(time=time, found=good, base=base, margin=margin, reason=reason))
+        return dc.replace(m, stance=Stance(time=estimate.time, found=good, base=base, margin=margin, reason=reason))
 
     # ------------------------------------------------------------ measure
     def _look(self, time: float, m: Memory, estimate: RectangleEstimate) -> Memory:
@@ -295,7 +298,7 @@ class KinematicApproach:
             near = all(self._mark_ratio(marks, side) >= self.config.mark_ratio for side in SIDES)
             if arrived or near:
                 why = "at the stand-off" if arrived else "marks are large enough"
-                m = dc.replace(m, phase="rest", since=time, path=None)
+                m = dc.replace(m, phase="rest", since=time, path=m.path if arrived else None)
                 m = self._status(m, time, "running", detail=why)
         if m.phase == "rest" and time >= m.since + self.config.rest:
             m = self._status(dc.replace(m, phase="end"), time, "succeeded", detail=m.status.detail)

@@ -4,13 +4,13 @@ from typing import Any
 
 from valve_drake.behaviors.valve_search import HeadPose, Memory, ValveSearchConfig, step
 from valve_drake.messages import Command, ModeState, RectangleEstimate, RobotState, Status, StereoPosition
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import TICK, Block, Inputs
 
 NO_POSITION, NO_ESTIMATE = StereoPosition(), RectangleEstimate()
 
 
 class ValveSearchSystem(Block):
-    """Search and gaze; 1/128 s, slot 1.
+    """Search and gaze; 1/64 s (wheels and neck need no more), slot 1.
 
     | port | dir | type |
     |---|---|---|
@@ -36,7 +36,7 @@ class ValveSearchSystem(Block):
         config.check()
         self.config = config
         self.head_pose = head_pose
-        super().__init__(name)
+        super().__init__(name, period=2 * TICK)
 
     def initial(self) -> Memory:
         return Memory()

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import yaml
 
-from valve_drake.checks import ConfigError, require
+from valve_drake.checks import ConfigError, require, require_in
 
 _NEWTON_STEPS = 6  # quadratic: 1e-12 px after four steps for any lens that `check` lets pass
 
@@ -168,6 +168,7 @@ class StereoHead:
     left: LensModel
     right: LensModel
     X_LR: np.ndarray
+    rms_px: float = 0.0  # residual of the calibration's own corners, 0 where unknown: what pixels are worth in 3D
 
     def __post_init__(self) -> None:
         X = np.array(self.X_LR, float)
@@ -183,6 +184,29 @@ class StereoHead:
 
 def load_head(path: str | pathlib.Path) -> StereoHead:
     """Reads a head calibration (see `save_head`). Raises ConfigError naming the file and the key."""
+    data = read_yaml(path)
+    rms_px = data.pop("rms_px", 0.0)
+    _require_keys(data, {"left", "right", "X_LR"}, f"calibration {path}")
+    require_in(rms_px, 0.0, 1e6, f"calibration {path}: rms_px")
+    try:
+        X_LR = np.array(data["X_LR"], float)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"calibration {path}: X_LR must be 3 rows of 4 numbers") from error
+    require(X_LR.shape == (3, 4), f"calibration {path}: X_LR", "3 rows of 4 numbers", data["X_LR"])
+    lenses = [lens_from(data[side], f"calibration {path}: {side}") for side in ("left", "right")]
+    return StereoHead(lenses[0], lenses[1], X_LR, rms_px=float(rms_px))
+
+
+def save_head(head: StereoHead, path: str | pathlib.Path, comment: str = "") -> None:
+    """Writes the calibration as plain YAML; every number survives the round trip bit for bit."""
+    data: dict[str, Any] = {"left": lens_to(head.left), "right": lens_to(head.right), "X_LR": head.X_LR.tolist()}
+    if head.rms_px:
+        data["rms_px"] = float(head.rms_px)
+    write_yaml(data, path, comment)
+
+
+def read_yaml(path: str | pathlib.Path) -> dict[str, Any]:
+    """The mapping in a YAML file of a calibration. Raises ConfigError naming the file."""
     try:
         data = yaml.safe_load(pathlib.Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -191,25 +215,21 @@ def load_head(path: str | pathlib.Path) -> StereoHead:
         line = f" at line {error.problem_mark.line + 1}" if getattr(error, "problem_mark", None) else ""
         raise ConfigError(f"calibration {path}: not YAML{line}") from error
     require(isinstance(data, dict), f"calibration {path}", "a mapping with left, right and X_LR", type(data).__name__)
-    _require_keys(data, {"left", "right", "X_LR"}, f"calibration {path}")
-    try:
-        X_LR = np.array(data["X_LR"], float)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"calibration {path}: X_LR must be 3 rows of 4 numbers") from error
-    require(X_LR.shape == (3, 4), f"calibration {path}: X_LR", "3 rows of 4 numbers", data["X_LR"])
-    lenses = [_lens_from(data[side], f"calibration {path}: {side}") for side in ("left", "right")]
-    return StereoHead(lenses[0], lenses[1], X_LR)
+    return data
 
 
-def save_head(head: StereoHead, path: str | pathlib.Path, comment: str = "") -> None:
-    """Writes the calibration as plain YAML; every number survives the round trip bit for bit."""
-    data = {"left": _lens_to(head.left), "right": _lens_to(head.right), "X_LR": head.X_LR.tolist()}
+def write_yaml(data: dict[str, Any], path: str | pathlib.Path, comment: str = "") -> None:
+    """Writes a mapping below lines of comment. Raises ConfigError naming the file."""
     lines = "".join(f"# {line}\n" for line in comment.splitlines())
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)
-    pathlib.Path(path).write_text(lines + text, encoding="utf-8")
+    try:
+        pathlib.Path(path).write_text(lines + text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.__class__.__name__})") from error
 
 
-def _lens_from(data: Any, key: str) -> LensModel:
+def lens_from(data: Any, key: str) -> LensModel:
+    """The lens of a mapping made by `lens_to`. Raises ConfigError naming `key`."""
     require(isinstance(data, dict), key, "a mapping", data)
     kind = OpenCvLens if "K" in data else Lens
     _require_keys(data, {f.name for f in dc.fields(kind)}, key)
@@ -221,7 +241,8 @@ def _lens_from(data: Any, key: str) -> LensModel:
     return lens
 
 
-def _lens_to(lens: LensModel) -> dict[str, Any]:
+def lens_to(lens: LensModel) -> dict[str, Any]:
+    """The lens's fields as plain numbers and lists."""
     values = dc.asdict(lens)
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 

@@ -25,6 +25,7 @@ _BEFORE = [3, 0, 1, 2]
 # Of the six functions 1, tau, rise, tau rise, bell, tau bell: the index of each product, and its power of tau.
 _PRODUCT = np.repeat(np.repeat([[0, 1, 2], [1, 3, 4], [2, 4, 5]], 2, axis=0), 2, axis=1)
 _TAU_POWER = np.tile([[0, 1], [1, 2]], (3, 3))
+_REACH = 4.5  # half a profile's length that holds a blurred step [blur]
 _PAD = 12  # room round the quadrilateral [px]
 _PRIOR_POINTS = 20  # how many points the noise predicted from the grey values counts for, against the scatter seen
 
@@ -133,13 +134,19 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: LineF
         if contrast < config.min_contrast:
             out[k] = RawQuad(reason=f"contrast: {contrast:.0f}")
             continue
-        sides = _place(channel, _hough_corners(channel, near - low), config)
+        coarse = _hough_corners(channel, near - low)
+        sides = _place(channel, coarse, config)
         if isinstance(sides, str):
             out[k] = RawQuad(reason=sides)
         else:
-            parts.append((k, low, sides))
+            parts.append((k, low, coarse, sides))
     if parts:
-        for (k, low, _), raw in zip(parts, _fit_sides([sides for _, _, sides in parts], config)):
+        for (k, low, coarse, sides), raw in zip(parts, _fit_sides([part[-1] for part in parts], config)):
+            if int(_REACH * raw.blur) > sides.half:
+                # A step that reaches beyond its profiles is fitted once more, to longer ones.
+                wide = _place(sides.channel, coarse, config, _REACH * raw.blur)
+                if not isinstance(wide, str) and wide.half > sides.half:
+                    raw = _fit_sides([wide], config)[0]
             out[k] = raw if raw.reason else dc.replace(raw, points=raw.points + low)
     return out
 
@@ -240,8 +247,13 @@ class _Sides:
     half: int  # of a profile [px]
 
 
-def _place(channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> _Sides | str:
-    """Lays the profiles across the sides of a coarse quadrilateral; or why it cannot."""
+def _place(
+    channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig, least: float = 0.0
+) -> _Sides | str:
+    """Lays the profiles across the sides of a coarse quadrilateral; or why it cannot.
+
+    least: half a profile's length that blur calls for, if the opposite side is far enough [px].
+    """
     ends = corners[NEXT]
     along = ends - corners
     lengths = np.linalg.norm(along, axis=1)
@@ -254,7 +266,7 @@ def _place(channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig) 
     cosine = 1 / np.sqrt(1 + slope**2)
     # A profile must reach neither the opposite side nor the rim of the light plate round the marker.
     width = polygon_area(corners) / lengths.max()
-    half = int(np.clip(round(0.12 * width), 3, config.half_window))
+    half = int(max(np.clip(round(0.12 * width), 3, config.half_window), min(least, 0.3 * width)))
     # The light plate is narrowest at the corners, which only small markers feel.
     reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 4.0)) + half * np.abs(slope) * cosine
     begin = np.minimum(corners[four, t_axis], ends[four, t_axis]) + reach * cosine

@@ -1,4 +1,4 @@
-"""The target: a rectangle of known size on the valve, with two green marks beside it, on handles that hands can hold."""
+"""The target: a rectangle of known size on the valve, two green marks beside it on handles for the hands."""
 
 import dataclasses as dc
 
@@ -14,7 +14,7 @@ _UNIT_CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float
 
 @dc.dataclass
 class Marker:
-    """Scenario key `marker`: what is known of the valve beforehand, in V: x along the handles, y down, z into the panel."""
+    """Scenario key `marker`: what is known of the valve beforehand, in V (x along the handles, z into the panel)."""
 
     size: list[float] = dc.field(default_factory=lambda: [0.098, 0.100])  # 2 X_w, 2 Y_w [m]
     handle_radius: float = 0.15  # of the green marks from the axis, along +x and -x of V [m]

@@ -24,6 +24,21 @@ class Sink(Protocol):
     def flush(self) -> None: ...
 
 
+class Tee:
+    """Several sinks as one."""
+
+    def __init__(self, *sinks: Sink):
+        self._sinks = sinks
+
+    def write(self, topic: str, message: Message | Proto, time: float) -> None:
+        for sink in self._sinks:
+            sink.write(topic, message, time)
+
+    def flush(self) -> None:
+        for sink in self._sinks:
+            sink.flush()
+
+
 @dc.dataclass(frozen=True)
 class Signal:
     """One row of the recorder's table: what is read, when it is written, and as what.

@@ -66,6 +66,14 @@ OUTPUTS: tuple[tuple[str, str, type[Message]], ...] = (  # block, port, kind: re
     ("operator", "command", OperatorCommand),
 )
 
+FRAMES: dict[str, tuple[str, type[Message], Callable[[Any], CameraFrame]]] = {  # camera -> who looks at its images
+    **{
+        f"head_{side}": ("color_segmentation.segmentation", SegmentationPair, lambda m, s=side: getattr(m, s).frame)
+        for side in SIDES
+    },
+    **{f"{side}_wrist": ("handle_marker.marks", HandleMarks, lambda m, s=side: getattr(m, s).frame) for side in SIDES},
+}
+
 BELIEF: dict[str, type[Message]] = {  # what the 3D view is made of
     "robot_state.robot_state": RobotState,
     "rectangle_estimator.estimate": RectangleEstimate,
@@ -133,8 +141,13 @@ def signals(
     if scene is not None:
         rows += [Signal("/scene", {}, lambda time: scene, period=ONCE)]
     rows += [*mode_events(), health_line(), *(status_line(block) for block in BEHAVIORS)]
-    rows += [vector(f"/{port.replace('.', '/')}", port, names, SLOW) for port, names in TRUTH.items()]
+    rows += [vector(topic_of(port), port, names, SLOW) for port, names in TRUTH.items()]
     return rows
+
+
+def topic_of(port: str) -> str:
+    """<block>.<port> -> /<block>/<port>."""
+    return "/" + port.replace(".", "/")
 
 
 # ---- makers of rows
@@ -146,7 +159,8 @@ def as_it_is(time: float, message: Message) -> Message:
 
 def output(block: str, port: str, kind: type[Message], period: float = TICK) -> Signal:
     """A block's output, on topic /<block>/<port>."""
-    return Signal(f"/{block}/{port}", {f"{block}.{port}": kind}, as_it_is, period)
+    name = f"{block}.{port}"
+    return Signal(topic_of(name), {name: kind}, as_it_is, period)
 
 
 def vector(topic: str, port: str, names: Sequence[str], period: float = TICK) -> Signal:
@@ -187,8 +201,9 @@ def joints(topic: str, ports: Mapping[str, Sequence[str]]) -> Signal:
     return Signal(topic, {port: len(values) for port, values in ports.items()}, encode)
 
 
-def image(camera: str, port: str, kind: type[Message], frame: Callable[[Any], CameraFrame]) -> Signal:
-    """The images that a consumer has looked at: `frame`(its message)."""
+def image(camera: str) -> Signal:
+    """The images of a camera that its consumer has looked at."""
+    port, kind, frame = FRAMES[camera]
 
     def key(message: Message) -> tuple[float, int]:
         return frame(message).time, frame(message).sequence
@@ -203,11 +218,8 @@ def head_camera(side: str) -> list[Signal]:
         fitted = getattr(edges, side) if edges.sequence == pair.sequence else None
         return foxglove.detections(getattr(pair, side), fitted)
 
-    port = "color_segmentation.segmentation"
-    return [
-        image(f"head_{side}", port, SegmentationPair, lambda pair: getattr(pair, side).frame),
-        Signal(f"/head_{side}/detections", {port: SegmentationPair, "line_fitting.edges": MarkerEdges}, encode),
-    ]
+    inputs = {"color_segmentation.segmentation": SegmentationPair, "line_fitting.edges": MarkerEdges}
+    return [image(f"head_{side}"), Signal(f"/head_{side}/detections", inputs, encode)]
 
 
 def wrist_camera(side: str) -> list[Signal]:
@@ -216,11 +228,7 @@ def wrist_camera(side: str) -> list[Signal]:
     def encode(time: float, marks: HandleMarks) -> Any:
         return foxglove.mark_detections(getattr(marks, side))
 
-    port = "handle_marker.marks"
-    return [
-        image(f"{side}_wrist", port, HandleMarks, lambda marks: getattr(marks, side).frame),
-        Signal(f"/{side}_wrist/detections", {port: HandleMarks}, encode),
-    ]
+    return [image(f"{side}_wrist"), Signal(f"/{side}_wrist/detections", {"handle_marker.marks": HandleMarks}, encode)]
 
 
 def calibration(camera: str, size: tuple[int, int], K: np.ndarray) -> Signal:

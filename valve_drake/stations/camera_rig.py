@@ -1,8 +1,8 @@
 """The simulated cameras: rendered images through a real lens, blur, noise and JPEG.
 
 `CameraRig` owns a scene of its own, made only to be rendered; a camera block keeps the joint positions at capture
-time and renders from them when somebody reads its port. So an image shows the instant it was taken, whenever it is read,
-and a camera that nobody looks at costs nothing.
+time and renders from them when somebody reads its port. So an image shows the instant it was taken, whenever it is
+read, and a camera that nobody looks at costs nothing.
 
 Pixel convention: Drake's renderer puts the centre of the first pixel at (0.5, 0.5), everybody else here at (0, 0).
 It is converted in `_Lensed.__init__` alone.

@@ -1,4 +1,4 @@
-"""The simulated station: contact physics, joint servos, wrist sensors, cameras and odometry behind the contract's ports.
+"""The simulated station: contact physics, joint servos, sensors and cameras behind the contract's ports.
 
 Nothing is welded or moved by hand: the fingers hold the handles by friction and the valve turns by the hands' forces.
 Joints are implicit PD servos with effort limits that get positions at 1/128 s, and gravity is fed forward from a model
@@ -122,9 +122,19 @@ def _add_servos(builder: DiagramBuilder, plant: MultibodyPlant, scene: Scene, st
     return driver
 
 
-def _rng(seed: int, stream: int, count: int) -> np.random.Generator:
-    """Random numbers that depend on nothing but these three."""
-    return np.random.Generator(np.random.SFC64([seed, 1000 + stream, count]))
+def _rng(seed: int, stream: int) -> np.random.Generator:
+    """Random numbers that depend on nothing but these two."""
+    return np.random.Generator(np.random.SFC64([seed, 1000 + stream]))
+
+
+class _Noise:
+    """Rows of white noise by their number: a function of the seed, so that it needs no state."""
+
+    def __init__(self, seed: int, stream: int, width: int):
+        self._rows = _rng(seed, stream).standard_normal((1 << 16, width))
+
+    def __call__(self, count: int) -> np.ndarray:
+        return self._rows[count % len(self._rows)]
 
 
 class OdometrySystem(Block):
@@ -141,8 +151,8 @@ class OdometrySystem(Block):
 
     def __init__(self, error: ErrorConfig, seed: int):
         self._error = error
-        self._seed = seed
-        self._scale = 1 + error.odometry_scale * _rng(seed, 0, 0).standard_normal(2)
+        self._noise = _Noise(seed, 1, 2)
+        self._scale = 1 + error.odometry_scale * _rng(seed, 0).standard_normal(2)
         super().__init__("odometry", slot=3)
 
     def initial(self) -> tuple[np.ndarray, int]:
@@ -152,7 +162,7 @@ class OdometrySystem(Block):
         (x, y, h, _, _), count = memory
         _, _, heading, vx, vy, w = inputs.base
         forward = vx * np.cos(heading) + vy * np.sin(heading)
-        noise = 1 + self._error.odometry_noise * _rng(self._seed, 1, count).standard_normal(2)
+        noise = 1 + self._error.odometry_noise * self._noise(count)
         forward, w = np.array([forward, w]) * self._scale * noise
         middle = h + w * TICK / 2
         new = np.array(
@@ -175,11 +185,11 @@ class WrenchSensorSystem(Block):
 
     def __init__(self, joints: dict[str, int], error: ErrorConfig, seed: int):
         self._joints = joints
-        self._seed = seed
+        self._noise = _Noise(seed, 3, 12)
         torque, force = np.ones(3), np.ones(3)
-        self._noise = np.concatenate([error.wrench_noise_torque * torque, error.wrench_noise_force * force])
+        self._scatter = np.concatenate([error.wrench_noise_torque * torque, error.wrench_noise_force * force])
         bias = np.concatenate([error.wrench_bias_torque * torque, error.wrench_bias_force * force])
-        draw = _rng(seed, 2, 0).standard_normal((2, 6))
+        draw = _rng(seed, 2).standard_normal((2, 6))
         self._bias = {side: bias * draw[k] for k, side in enumerate(SIDES)}
         super().__init__("wrench_sensor", slot=3)
 
@@ -188,12 +198,12 @@ class WrenchSensorSystem(Block):
 
     def step(self, time: float, inputs: Inputs, memory: int) -> tuple[int, dict]:
         forces = inputs.reaction_forces
-        draw = _rng(self._seed, 3, memory).standard_normal((2, 6))
+        draw = self._noise(memory).reshape(2, 6)
         out = {}
         for k, side in enumerate(SIDES):
             F = forces[self._joints[side]]  # on the hand, from the arm; the sensor feels the opposite
             felt = -np.concatenate([F.rotational(), F.translational()])
-            out[side] = felt + self._bias[side] + self._noise * draw[k]
+            out[side] = felt + self._bias[side] + self._scatter * draw[k]
         return memory + 1, out
 
 
@@ -237,7 +247,7 @@ class TruthSystem(Block):
         X = marker.GetFixedPoseInBodyFrame()
         self._X_LinkMarker = make(X.rotation().matrix(), X.translation())
         self._X_WP = None
-        super().__init__("truth", slot=0)
+        super().__init__("truth", period=1 / 32, slot=0)
 
     def place(self, X_WP: np.ndarray) -> "TruthSystem":
         self._X_WP = X_WP
@@ -258,7 +268,7 @@ class TruthSystem(Block):
 
 def true_head(head: StereoHead, error: ErrorConfig, seed: int) -> dict[str, Mount]:
     """The head cameras as they really are: the calibration plus the errors drawn from the seed."""
-    rng = _rng(seed, 4, 0)
+    rng = _rng(seed, 4)
     mount = make(rotation(error.head_mount * rng.standard_normal(3)), np.zeros(3))
     wobble = error.head_rotation * rng.standard_normal(3)
     wobble[1] = error.head_yaw * rng.standard_normal()  # about y of the camera: relative yaw
@@ -320,7 +330,7 @@ def make_simulated_station(
     seed: int,
     meshcat: Meshcat | None = None,
 ) -> Diagram:
-    """The station as a Diagram named `simulated`. simulation: resolved (no distributions left); home: both arms (12,)."""
+    """The station as a Diagram. simulation: resolved (no distributions left); home: both arms (12,) [rad]."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=SLOT, discrete_contact_approximation="lagged", contact_model="point", stiction_tolerance=1e-4

@@ -1,0 +1,481 @@
+"""kinematic_approach: free, bounded motions of both arms; where to stand; what is measured at rest before and after the turn."""
+
+import dataclasses as dc
+
+import numpy as np
+import pytest
+from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+
+from valve_drake import resources
+from valve_drake.behaviors.grasp_geometry import StanceConfig, find_stance, hand_in_valve, standoff, turned
+from valve_drake.behaviors.kinematic_approach import CONTACT, KinematicApproach, KinematicApproachConfig, Memory
+from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
+from valve_drake.behaviors.taught import load_taught
+from valve_drake.checks import ConfigError
+from valve_drake.collision import CollisionModel
+from valve_drake.frames import compose, inverse, make, planar, rotation, rotation_vector
+from valve_drake.kinematics import ARM_LIMITS, GEOMETRY
+from valve_drake.messages import (
+    SIDES,
+    Command,
+    HandleMark,
+    HandleMarks,
+    Mode,
+    ModeState,
+    RectangleEstimate,
+    RobotState,
+    Stance,
+    Status,
+    TurnState,
+)
+from valve_drake.perception.marker import Marker
+from valve_drake.ports import TICK
+from valve_drake.stations.scene import panel_pose
+from valve_drake.stations.simulation_config import ValveConfig
+
+CONFIG = KinematicApproachConfig()
+STANCE = StanceConfig(distance_min=0.70, distance_max=0.78)  # fewer places to try: quicker
+MARKER = Marker()
+TAUGHT = load_taught(resources.models() / "taught" / "hands.yaml")
+VIEW = {side: TAUGHT[side].view for side in SIDES}
+AREA = {side: TAUGHT[side].area for side in SIDES}
+MIRROR = np.array([1, -1, -1, -1, -1, -1])
+HOME = np.concatenate([CONFIG.home, CONFIG.home * MIRROR])
+QUARTER = np.pi / 2
+IMAGE = 16  # ticks between estimates
+X_OV = compose(
+    planar(1.5, -0.4, 0.2), panel_pose(ValveConfig(height=1.0)), make(np.eye(3), np.array([0, 0, -MARKER.panel_depth]))
+)
+
+
+@pytest.fixture(scope="module")
+def collision():
+    return CollisionModel(MARKER)
+
+
+@pytest.fixture(scope="module")
+def base():
+    return find_stance(X_OV, QUARTER, GEOMETRY, MARKER, STANCE, VIEW)[0]
+
+
+class Bench:
+    """Arms that follow at once, a head camera that sees the marker with some noise 8 times a second."""
+
+    def __init__(self, base: np.ndarray, is_free=lambda X_BV, q: True, *, arms: np.ndarray = HOME, config=CONFIG):
+        self.law = KinematicApproach(config, STANCE, MARKER, GEOMETRY, VIEW, AREA, is_free)
+        self.base, self.X_OV, self.axis_known = base, X_OV, True
+        self.rng = np.random.default_rng(0)
+        self.noise = np.array([0.002] * 3 + [0.001] * 3)  # of an estimate [rad, m]
+        self.arms, self.torso = arms.copy(), np.array([0.0, 0.3, 0.0])
+        self.memory, self.time, self.tick, self.activation = Memory(), 5.0, 0, 0
+        self.estimate, self.marks, self.turn = RectangleEstimate(), HandleMarks(), TurnState()
+        self.taken = RectangleEstimate()  # comes out one image later
+        self.seen = True
+        self.commands: list[np.ndarray] = []
+
+    def look(self) -> RectangleEstimate:
+        X_OL = GEOMETRY.head_pose(self.base, self.torso)
+        X_LV = compose(inverse(X_OL), self.X_OV)
+        e = self.rng.normal(size=6) * self.noise
+        return RectangleEstimate(
+            time=self.time,
+            sequence=self.tick // IMAGE,
+            found=self.seen,
+            X_LV=make(X_LV[:, :3] @ rotation(e[:3]), X_LV[:, 3] + e[3:]),
+            X_OL=X_OL,
+            covariance=np.diag(self.noise**2),
+            axis_known=self.axis_known,
+        )
+
+    def step(self, mode: ModeState) -> Status:
+        if self.tick % IMAGE == 0:
+            self.estimate, self.taken = self.taken, self.look()
+        state = RobotState(
+            time=self.time,
+            odometry=[*self.base, 0, 0],
+            torso=self.torso,
+            left_arm=self.arms[:6],
+            right_arm=self.arms[6:],
+        )
+        self.memory, self.command = self.law.step(
+            self.time, self.memory, state, mode, self.estimate, self.marks, self.turn
+        )
+        if self.command.left_arm is not None:
+            self.arms = np.concatenate([self.command.left_arm, self.command.right_arm])
+            self.commands.append(self.arms)
+        self.time += TICK
+        self.tick += 1
+        return self.memory.status
+
+    def run(self, mode: Mode, *, limit: float = 12.0, turn_angle: float = QUARTER, each=None) -> Status:
+        """One activation until it ends, or `limit` seconds."""
+        self.activation += 1
+        self.commands = []
+        state = ModeState(mode=mode.value, activation=self.activation, turn_angle=turn_angle)
+        for _ in range(int(limit / TICK)):
+            status = self.step(state)
+            if each is not None:
+                each(self)
+            if status.state in ("succeeded", "failed"):
+                break
+        return status
+
+    def measured(self) -> "Bench":
+        assert self.run(Mode.MEASURE).state == "succeeded"
+        return self
+
+    def at_standoff(self) -> "Bench":
+        assert self.measured().run(Mode.REACH).state == "succeeded"
+        return self
+
+
+def assert_smooth(commands: list[np.ndarray]) -> None:
+    q = np.array(commands)
+    speed = np.diff(q, axis=0) / TICK
+    assert np.abs(speed).max() <= CONFIG.joint_speed * (1 + 1e-9)
+    assert np.abs(np.diff(speed, axis=0)).max() / TICK <= 1.01 * CONFIG.joint_acceleration
+    assert np.abs(q).max(axis=0) == pytest.approx(np.minimum(np.abs(q).max(axis=0), np.tile(ARM_LIMITS, 2)))
+
+
+# ---------------------------------------------------------------- at home
+
+
+@pytest.mark.parametrize("mode", [Mode.IDLE, Mode.SEARCH, Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT, Mode.DONE])
+def test_where_it_has_nothing_else_to_do_the_arms_go_home_and_stay(base, mode):
+    bench = Bench(base, arms=HOME + np.tile([0.2, -0.1, 0.3, 0.4, -0.2, 0.1], 2))
+    start = bench.arms
+    bench.run(mode, limit=2.0)
+    assert bench.commands[0] == pytest.approx(start, abs=1e-9)
+    assert bench.arms == pytest.approx(HOME)
+    assert_smooth([start, *bench.commands])
+    assert bench.command.left_gripper.tolist() == [CONFIG.opening, CONFIG.gripper_force]
+    assert bench.command.base_twist is None and bench.command.torso is None
+    bench.run(mode, limit=0.1)
+    assert np.ptp(bench.commands, axis=0).max() == 0
+
+
+def test_home_mirrors_from_left_to_right(base):
+    law = Bench(base).law
+    left, right = (GEOMETRY.arm_forward(law.home[6 * k : 6 * k + 6], side)[:, 3] for k, side in enumerate(SIDES))
+    assert right == pytest.approx(left * [1, -1, 1])
+
+
+@pytest.mark.parametrize("mode", CONTACT)
+def test_in_contact_the_arms_belong_to_others_and_the_next_motion_starts_where_they_are(base, mode):
+    bench = Bench(base)
+    bench.run(Mode.IDLE, limit=0.1)
+    bench.run(mode, limit=0.05)
+    assert all(getattr(bench.command, f.name) is None for f in dc.fields(Command) if f.name != "time")
+    bench.arms = bench.arms + 0.3  # moved by another behaviour
+    bench.run(mode, limit=0.05)
+    moved = bench.arms
+    bench.run(Mode.RETREAT, limit=0.5)
+    assert bench.commands[0] == pytest.approx(moved, abs=1e-3)
+
+
+# ---------------------------------------------------------------- where to stand
+
+
+def test_the_stance_is_the_best_place_for_what_is_seen(base):
+    bench = Bench(np.array([0.1, -0.2, 0.1]))
+    bench.run(Mode.FINE_APPROACH, limit=0.2)
+    stance = bench.memory.stance
+    assert stance.found and stance.margin > 0.5
+    assert stance.base == pytest.approx(base, abs=0.025)  # within a step of the search and the noise
+    assert stance.time == 5.0  # of the image, not of the moment
+
+
+def test_the_stance_is_renewed_from_the_latest_looks():
+    bench = Bench(np.array([0.1, -0.2, 0.1]))
+    seen = []
+    bench.run(Mode.FINE_APPROACH, limit=3.2 * CONFIG.stance_period, each=lambda b: seen.append(b.memory.stance))
+    times = sorted({s.time for s in seen if s.found})
+    assert np.diff(times) == pytest.approx([CONFIG.stance_period] * 3, abs=1.1 * IMAGE * TICK)
+    bench.X_OV = make(X_OV[:, :3], X_OV[:, 3] + [0.10, 0, 0])  # the odometry has slipped
+    before = bench.memory.stance.base
+    bench.run(Mode.FINE_APPROACH, limit=3.2 * CONFIG.stance_period)
+    assert bench.memory.stance.base - before == pytest.approx([0.10, 0, 0], abs=0.03)
+
+
+def test_a_valve_out_of_reach_has_no_stance_and_says_so():
+    bench = Bench(np.array([0.1, -0.2, 0.1]))
+    bench.X_OV = make(X_OV[:, :3], X_OV[:, 3] + [0, 0, 0.8])
+    bench.run(Mode.FINE_APPROACH, limit=0.2)
+    assert not bench.memory.stance.found
+    assert "no stance" in bench.memory.stance.reason and "margin" in bench.memory.stance.reason
+
+
+def test_without_a_marker_there_is_no_stance_and_a_search_forgets_the_old_one():
+    bench = Bench(np.array([0.1, -0.2, 0.1]))
+    bench.seen = False
+    bench.run(Mode.FINE_APPROACH, limit=0.3)
+    assert bench.memory.stance == Stance() or not bench.memory.stance.found
+    bench.seen = True
+    bench.run(Mode.FINE_APPROACH, limit=0.3)
+    assert bench.memory.stance.found
+    bench.run(Mode.ROUGH_APPROACH, limit=0.1)
+    assert bench.memory.stance.found
+    bench.run(Mode.SEARCH, limit=0.1)
+    assert not bench.memory.stance.found
+
+
+# ---------------------------------------------------------------- measure
+
+
+def test_measuring_at_rest_gives_the_valve_and_the_grasps(base):
+    bench = Bench(base)
+    start = bench.time
+    status = bench.run(Mode.MEASURE)
+    assert status.state == "succeeded" and status.activation == 1
+    plan = bench.memory.plan
+    X_BV = compose(inverse(planar(*base)), X_OV)
+    assert plan.found and plan.margin > 0.5
+    assert plan.X_BV[:, 3] == pytest.approx(X_BV[:, 3], abs=0.0015)  # the mean of six is better than one
+    assert np.linalg.norm(rotation_vector(plan.X_BV[:, :3].T @ X_BV[:, :3])) < 0.004
+    for side in SIDES:
+        X_VG = compose(inverse(plan.X_BV), getattr(plan, f"X_BG_{side}"))
+        assert X_VG == pytest.approx(hand_in_valve(side, plan.swapped, MARKER))
+    assert np.trace(plan.covariance[3:, 3:]) < 3e-6
+    taken = CONFIG.settle + CONFIG.frames * IMAGE * TICK
+    assert bench.time - start == pytest.approx(taken, abs=2 * IMAGE * TICK)
+
+
+def test_only_images_taken_at_rest_count(base):
+    """What was captured before the robot had settled is an image of another place."""
+    bench = Bench(base)
+    wrong = make(X_OV[:, :3], X_OV[:, 3] + [0.05, 0, 0])
+    bench.X_OV = wrong
+
+    def settle(b):
+        if b.time >= 5.0 + CONFIG.settle:
+            b.X_OV = X_OV
+
+    assert bench.run(Mode.MEASURE, each=settle).state == "succeeded"
+    assert len(bench.memory.looks) == CONFIG.frames
+    assert all(look.time >= 5.0 + CONFIG.settle for look in bench.memory.looks)
+    assert compose(planar(*base), bench.memory.plan.X_BV)[:, 3] == pytest.approx(X_OV[:, 3], abs=0.0015)
+
+
+def test_each_image_counts_once(base):
+    bench = Bench(base)
+    bench.run(Mode.MEASURE)
+    assert len({look.sequence for look in bench.memory.looks}) == CONFIG.frames
+
+
+def test_without_a_marker_it_goes_on_measuring_until_the_supervisor_ends_it(base):
+    bench = Bench(base)
+    bench.seen = False
+    assert bench.run(Mode.MEASURE, limit=3.0).state == "running"
+
+
+def test_a_base_that_stands_wrong_asks_for_another_stance(base):
+    bench = Bench(base - 0.25 * np.array([np.cos(base[2]), np.sin(base[2]), 0]))
+    status = bench.run(Mode.MEASURE)
+    assert (status.state, status.verdict) == ("failed", "reach_limit")
+    assert status.detail.startswith("stance")  # the supervisor's word for driving again
+    assert bench.memory.stance.found
+    assert bench.memory.stance.base == pytest.approx(base, abs=0.025)
+
+
+# ---------------------------------------------------------------- reach
+
+
+def test_reaching_goes_free_and_smooth_to_the_standoff_and_rests_there(base, collision):
+    bench = Bench(base, collision.is_free).measured()
+    start = bench.arms
+    status = bench.run(Mode.REACH)
+    assert status.state == "succeeded", status.detail
+    assert status.detail == "at the stand-off"
+    plan = bench.memory.plan
+    X_BV = compose(inverse(planar(*base)), X_OV)
+    for k, side in enumerate(SIDES):
+        X_BG = compose(GEOMETRY.X_BH(), GEOMETRY.arm_forward(bench.arms[6 * k : 6 * k + 6], side))
+        goal = standoff(getattr(plan, f"X_BG_{side}"), VIEW[side], STANCE.standoff)
+        assert X_BG == pytest.approx(goal, abs=1e-9)
+    assert_smooth([start, *bench.commands])
+    for q in bench.commands[::4]:
+        assert collision.is_free(X_BV, q), collision.touching(X_BV, q)
+    rest = np.array(bench.commands[-int(CONFIG.rest / TICK) :])
+    assert np.ptp(rest, axis=0).max() == 0  # the wrist sensors are tared in this time
+
+
+def test_reaching_ends_when_both_marks_are_large_enough(base):
+    bench = Bench(base).measured()
+    begun = bench.time
+
+    def near(b):
+        if b.time > begun + 0.5:
+            big = 1.01 * CONFIG.mark_ratio**2
+            b.marks = HandleMarks(
+                left=HandleMark(found=True, area=big * AREA["left"]), right=HandleMark(found=True, area=big * AREA["right"])
+            )
+
+    status = bench.run(Mode.REACH, each=near)
+    assert status.state == "succeeded" and status.detail == "marks are large enough"
+    assert bench.time - begun == pytest.approx(0.5 + CONFIG.rest, abs=0.05)
+    assert np.ptp(bench.commands[-int(CONFIG.rest / TICK) :], axis=0).max() == 0
+
+
+@pytest.mark.parametrize("left, right", [(1.0, 0.5), (0.5, 1.0)])
+def test_one_large_mark_is_not_enough(base, left, right):
+    bench = Bench(base).measured()
+    bench.marks = HandleMarks(
+        left=HandleMark(found=True, area=left * AREA["left"]), right=HandleMark(found=True, area=right * AREA["right"])
+    )
+    assert bench.run(Mode.REACH).detail == "at the stand-off"
+
+
+def test_a_blocked_standoff_fails_with_a_verdict_and_the_arms_stay(base):
+    bench = Bench(base, lambda X_BV, q: bool(np.max(np.abs(q - HOME)) < 0.2)).measured()
+    status = bench.run(Mode.REACH)
+    assert (status.state, status.verdict) == ("failed", "reach_limit")
+    assert "no collision-free path" in status.detail
+    assert bench.arms == pytest.approx(HOME)
+
+
+def test_a_way_round_an_obstacle_stays_within_the_joint_limits(base):
+    """The shortest way round leads through angles that the elbow does not have."""
+    goal = []
+
+    def is_free(X_BV, q):
+        share = (q[0] - HOME[0]) / (goal[0][0] - HOME[0]) if goal else 0.0
+        return not 0.35 < share < 0.65 or bool(q[2] < HOME[2] - 0.60)  # J3 is -1.9 at home; its limit is -2.62
+
+    bench = Bench(base, is_free).measured()
+    goal.append(bench.law._standoff_joints(bench.memory.plan))
+    status = bench.run(Mode.REACH, limit=20)
+    assert status.state == "succeeded", status.detail
+    assert min(q[2] for q in bench.commands) < HOME[2] - 0.5  # it did go round
+    assert np.all(np.abs(bench.commands) <= np.tile(ARM_LIMITS, 2))
+
+
+# ---------------------------------------------------------------- verify
+
+
+def verify(base, true: float, hands: float, commanded: float = QUARTER, *, is_free=lambda X_BV, q: True, known=True):
+    bench = Bench(base, is_free).at_standoff()
+    bench.turn = TurnState(angle=hands)
+    bench.X_OV = turned(X_OV, true)
+    bench.axis_known = known
+    return bench, bench.run(Mode.VERIFY, turn_angle=commanded)
+
+
+def test_verify_brings_the_arms_home_free_and_smooth_before_it_looks(base, collision):
+    bench, status = verify(base, QUARTER, 1.56, is_free=collision.is_free)
+    assert status.state == "succeeded"
+    assert bench.arms == pytest.approx(HOME)
+    assert_smooth(bench.commands)
+    X_BV = turned(compose(inverse(planar(*base)), X_OV), 1.56)
+    for q in bench.commands[::4]:
+        assert collision.is_free(X_BV, q)
+    moved = np.flatnonzero(np.abs(np.diff(bench.commands, axis=0)).max(axis=1) > 0)
+    arrived = bench.time - TICK * (len(bench.commands) - moved[-1])
+    assert all(look.time > arrived + CONFIG.settle - 2 * TICK for look in bench.memory.looks)
+
+
+@pytest.mark.parametrize(
+    "true, hands, commanded, state",
+    [
+        (QUARTER, 1.56, QUARTER, "succeeded"),
+        (-QUARTER, -1.57, -QUARTER, "succeeded"),
+        (QUARTER - 0.02, 1.57, QUARTER, "succeeded"),  # within the tolerance
+        (QUARTER - 0.06, 1.57, QUARTER, "failed"),  # it sprang back
+        (1.2, 1.57, QUARTER, "failed"),  # the hands slipped by 21 deg
+        (0.9, 0.9, QUARTER, "failed"),  # a stop on the way
+        (0.3, 0.3, 0.3, "succeeded"),
+    ],
+)
+def test_the_camera_decides_whether_it_turned(base, true, hands, commanded, state):
+    _, status = verify(base, true, hands, commanded)
+    assert status.state == state
+    assert status.verdict == ("" if state == "succeeded" else "slip")
+    assert status.value == pytest.approx(true, abs=0.004)  # the camera's own angle, not the hands'
+    assert f"{np.degrees(status.value):.2f} deg" in status.detail
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_rectangle_that_looks_alike_after_part_of_a_turn_is_counted_by_the_hands(base, known):
+    """Green marks repeat every half turn, the rectangle alone every quarter."""
+    for true in (0.0, QUARTER, np.pi, 1.5 * np.pi):
+        bench = Bench(base)
+        seen = bench.law.seen_angle(X_OV, turned(X_OV, true if known else 0.0), known, true + 0.1)
+        assert seen == pytest.approx(true, abs=1e-9)
+    assert bench.law.seen_angle(X_OV, turned(X_OV, 0.2 + np.pi), True, 0.1) == pytest.approx(0.2)
+
+
+def test_no_way_home_fails_with_a_verdict(base):
+    free = [True]
+    bench = Bench(base, lambda X_BV, q: free[0]).at_standoff()
+    free[0] = False
+    status = bench.run(Mode.VERIFY)
+    assert (status.state, status.verdict) == ("failed", "reach_limit")
+    assert "home" in status.detail
+
+
+def test_a_marker_that_is_not_seen_again_leaves_verify_running(base):
+    bench = Bench(base).at_standoff()
+    bench.seen = False
+    assert bench.run(Mode.VERIFY, limit=6.0).state == "running"
+
+
+# ---------------------------------------------------------------- activations, config, block
+
+
+def test_a_new_activation_starts_afresh(base):
+    bench = Bench(base).measured()
+    assert bench.step(ModeState(mode="measure", activation=9)).state == "running"
+    assert (bench.memory.status.activation, bench.memory.looks) == (9, ())
+
+
+def test_the_same_inputs_give_the_same_bits(base, collision):
+    a, b = (Bench(base, collision.is_free).at_standoff() for _ in range(2))
+    assert np.array(a.commands).tobytes() == np.array(b.commands).tobytes()
+
+
+@pytest.mark.parametrize("changes", [{"home": [0.0] * 5}, {"joint_speed": 0.0}, {"frames": 0}, {"rest": float("nan")}])
+def test_bad_config_is_refused_by_name(changes):
+    with pytest.raises(ConfigError, match=f"kinematic_approach.{next(iter(changes))}"):
+        Bench(np.zeros(3), config=dc.replace(CONFIG, **changes))
+
+
+def rig(**inputs) -> Rig:
+    bench = Bench(np.array([0.1, -0.2, 0.1]), arms=HOME + 0.1)
+    state = RobotState(odometry=[*bench.base, 0, 0], left_arm=bench.arms[:6], right_arm=bench.arms[6:])
+    fixed = {
+        "robot_state": state,
+        "mode": ModeState(mode="fine_approach", activation=1, turn_angle=QUARTER),
+        "estimate": bench.look(),
+        "marks": HandleMarks(),
+        "turn": TurnState(),
+    }
+    return Rig(KinematicApproachSystem(bench.law), **fixed | inputs)
+
+
+def test_ports():
+    assert ports(rig().block) == {
+        "robot_state": "in abstract",
+        "mode": "in abstract",
+        "estimate": "in abstract",
+        "marks": "in abstract",
+        "turn": "in abstract",
+        "command": "out abstract",
+        "status": "out abstract",
+        "stance": "out abstract",
+        "plan": "out abstract",
+    }
+
+
+def test_block_says_where_to_stand_and_sends_the_arms_home():
+    dut = rig().run(1.5)
+    assert dut.read("stance").found
+    assert dut.read("command").left_arm == pytest.approx(HOME[:6])
+    assert dut.read("status").state == "idle" and not dut.read("plan").found
+
+
+def test_block_holds_its_outputs_between_updates():
+    assert_holds_between_updates(rig(), "command", slot=1)
+
+
+def test_block_clones_are_independent():
+    change = {"mode": ModeState(mode="measure", activation=2)}
+    assert_clones_are_independent(rig, change, ("command", "status", "stance"))

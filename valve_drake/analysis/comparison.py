@@ -1,0 +1,200 @@
+"""Messages held against the recorded ones, tick by tick: equal to the bit, or where and by how much not."""
+
+import dataclasses as dc
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from google.protobuf.message import Message as Proto
+
+from valve_drake.messages import Message
+from valve_drake.recording import schemas
+from valve_drake.recording.foxglove import NANO, nanoseconds
+from valve_drake.recording.reader import LogReader, Record
+
+TRUTH = "/truth/"  # begins the topics that only a simulation has
+LONGEST = 60  # of a value in a report [characters]
+
+
+class Divergence(NamedTuple):
+    """Where two messages differ. field "": one of the two does not exist, and its value is None."""
+
+    time: float  # [s]
+    topic: str
+    field: str
+    recorded: Any
+    replayed: Any
+
+    def __str__(self) -> str:
+        change = f"{_short(self.recorded)} -> {_short(self.replayed)}"
+        if not self.field:
+            change = "only in the replay" if self.recorded is None else "not in the replay"
+        return f"{self.topic} {self.field} {change}".replace("  ", " ")
+
+    def as_json(self) -> dict:
+        plain = {key: _plain(value) for key, value in self._asdict().items()}
+        return {"time_s": plain.pop("time")} | plain
+
+
+@dc.dataclass
+class TopicDifference:
+    """One topic; messages of the same time are held against each other."""
+
+    recorded: int = 0
+    replayed: int = 0
+    equal: int = 0
+    first: Divergence | None = None
+    largest: Divergence | None = None  # of all numbers
+
+    @property
+    def identical(self) -> bool:
+        return self.recorded == self.replayed == self.equal
+
+    @property
+    def max_difference(self) -> float:
+        return 0.0 if self.largest is None else abs(self.largest.recorded - self.largest.replayed)
+
+
+class Comparison:
+    """A recorder's sink: what is written is compared with what a log holds up to `end` [s], the truth left out.
+
+    topics: TopicDifference by name, complete after `finish`. first: the first difference in time; of those in one tick,
+    the one whose topic was the first in the log. That is the order of the recorder's table, in which data flows.
+    """
+
+    def __init__(self, log: LogReader, end: float):
+        self.topics = {name: TopicDifference() for name in log.topics if not name.startswith(TRUTH)}
+        self.first: Divergence | None = None
+        self._log = log
+        self._kinds: dict[str, type[Message] | type[Proto]] = {}  # that were written, by topic
+        self._recorded = itertools.groupby(log.records(list(self.topics), end=end), lambda record: record.when)
+        self._next = next(self._recorded, None)
+        self._when = 0  # [ns]
+        self._replayed: list[tuple[str, bytes]] = []  # at that time
+
+    @property
+    def identical(self) -> bool:
+        return all(topic.identical for topic in self.topics.values())
+
+    @property
+    def max_difference(self) -> float:
+        return max((topic.max_difference for topic in self.topics.values()), default=0.0)
+
+    def write(self, topic: str, message: Message | Proto, time: float) -> None:
+        if topic.startswith(TRUTH):
+            return
+        when = nanoseconds(time)
+        if when != self._when:
+            self._settle()
+            self._when = when
+        self._kinds[topic] = type(message)
+        data = schemas.encode(message) if isinstance(message, Message) else message.SerializeToString()
+        self._replayed.append((topic, data))
+
+    def flush(self) -> None:
+        """Nothing is kept back."""
+
+    def finish(self) -> None:
+        """Compares what is left when all has been written."""
+        self._settle()
+        while self._next is not None:
+            self._compare_next([])
+
+    def _settle(self) -> None:
+        """Compares all up to the time of the last messages that were written."""
+        while self._next is not None and self._next[0] < self._when:
+            self._compare_next([])
+        if self._next is not None and self._next[0] == self._when:
+            self._compare_next(self._replayed)
+        else:
+            self._compare(self._when, [], self._replayed)
+        self._replayed = []
+
+    def _compare_next(self, replayed: list[tuple[str, bytes]]) -> None:
+        when, records = self._next
+        self._compare(when, [(record.topic, record.data) for record in records], replayed)
+        self._next = next(self._recorded, None)
+
+    def _compare(self, when: int, recorded: list[tuple[str, bytes]], replayed: list[tuple[str, bytes]]) -> None:
+        for topic, _ in recorded:
+            self.topics[topic].recorded += 1
+        for topic, _ in replayed:
+            self.topics.setdefault(topic, TopicDifference()).replayed += 1
+        if recorded == replayed:
+            for topic, _ in recorded:
+                self.topics[topic].equal += 1
+            return
+        touched = {topic for topic, _ in itertools.chain(recorded, replayed)}
+        for topic in (name for name in self.topics if name in touched):
+            pairs = itertools.zip_longest(_of(topic, recorded), _of(topic, replayed))
+            for before, after in pairs:
+                if before == after:
+                    self.topics[topic].equal += 1
+                else:
+                    self._note(when, topic, before, after)
+
+    def _note(self, when: int, topic: str, before: bytes | None, after: bytes | None) -> None:
+        """Takes down how two messages differ."""
+        total = self.topics[topic]
+        if before is None or after is None:
+            found = [("", None if before is None else "", None if after is None else "")]
+        else:
+            found = differences(self._log.decode(Record(topic, when, 0, before)), self._decode(topic, after))
+            found = found or [("(encoding)", "", "")]  # by a program that had other fields
+        for field, a, b in found:
+            change = Divergence(when / NANO, topic, field, a, b)
+            self.first = self.first or change
+            total.first = total.first or change
+            if isinstance(a, float) and isinstance(b, float) and abs(a - b) > total.max_difference:
+                total.largest = change
+
+    def _decode(self, topic: str, data: bytes) -> Message | Proto:
+        kind = self._kinds[topic]
+        return schemas.decode(kind, data) if issubclass(kind, Message) else kind.FromString(data)
+
+
+def differences(a: Any, b: Any, path: str = "") -> list[tuple[str, Any, Any]]:
+    """Every field in which two messages differ, if only in a bit: its path and both values, None where one has none."""
+    if isinstance(a, Message) and isinstance(b, Message):
+        names = {**vars(a), **vars(b)}
+    elif isinstance(a, Proto) and isinstance(b, Proto):
+        names = {**a.DESCRIPTOR.fields_by_name, **b.DESCRIPTOR.fields_by_name}
+    elif isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and a.shape == b.shape:
+        if a.tobytes() == b.tobytes():
+            return []
+        values = zip(np.ndindex(a.shape), a.ravel().tolist(), b.ravel().tolist())
+        return [(f"{path}{list(k)}", x, y) for k, x, y in values if repr(x) != repr(y)]
+    elif _is_list(a) and _is_list(b) and len(a) == len(b):
+        return _all(differences(x, y, f"{path}[{k}]") for k, (x, y) in enumerate(zip(a, b)))
+    elif a is b or repr(a) == repr(b):
+        return []
+    else:
+        return [(path, a, b)]
+    prefix = f"{path}." if path else ""
+    return _all(differences(getattr(a, name, None), getattr(b, name, None), prefix + name) for name in names)
+
+
+def _all(parts: Iterable[list]) -> list:
+    return list(itertools.chain.from_iterable(parts))
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
+def _of(topic: str, messages: list[tuple[str, bytes]]) -> Iterator[bytes]:
+    return (data for name, data in messages if name == topic)
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON has it."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float) else _short(value)
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else " ".join(repr(value).split())
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."

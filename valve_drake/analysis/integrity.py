@@ -1,0 +1,154 @@
+"""Is a log whole? Damage, messages that are missing, and gaps against the rate that each topic should have."""
+
+import dataclasses as dc
+
+import numpy as np
+
+from valve_drake.messages import SIDES
+from valve_drake.ports import TICK
+from valve_drake.recording.foxglove import NANO
+from valve_drake.recording.layout import HEAD, WRIST
+from valve_drake.recording.reader import LogReader
+from valve_drake.recording.signals import BEHAVIORS, SLOW, TRUTH
+
+CAMERAS = HEAD + WRIST
+
+# What writes a message at every period while the program runs. A test holds this table to signals.py and to a log.
+PERIODS: dict[str, float] = {
+    **{f"/{block}/command": TICK for block in BEHAVIORS},
+    **{topic: TICK for topic in ("/image_servo/servo", "/command_selector/report", "/joint_states", "/joint_commands")},
+    **{f"/{block}/status": TICK for block in ("valve_search", "base_approach")},
+    **{f"/{side}_wrist/wrench": TICK for side in SIDES},
+    **{topic: SLOW for topic in ("/supervisor/mode", "/robot_state/robot_state", "/health", "/tf")},
+    **{"/" + port.replace(".", "/"): SLOW for port in TRUTH},
+    **{f"/{camera}/calibration": 1.0 for camera in CAMERAS},
+}
+# What follows the cameras: only images that the mode asks for are taken, so there is no rate over the run.
+GATED = frozenset(
+    ("/color_segmentation/segmentation", "/line_fitting/edges", "/stereo_positioning/position", "/handle_marker/marks")
+    + ("/rectangle_estimator/estimate", "/rectangle_estimator/pose")
+    + tuple(f"/{camera}/{what}" for camera in CAMERAS for what in ("image", "detections"))
+)
+LATE = 1.5  # periods after which a message is late
+
+
+@dc.dataclass(frozen=True)
+class Gap:
+    """Between two messages of a topic, or between one and the log's start or end."""
+
+    start: float  # [s]
+    end: float
+    missing: int  # messages that should be between them
+
+
+@dc.dataclass(frozen=True)
+class TopicRow:
+    """One topic's share of a log. kind: periodic, gated (follows the cameras) or changes (written when it changes)."""
+
+    topic: str
+    schema: str
+    count: int
+    kind: str
+    period_s: float | None  # expected
+    median_s: float | None  # observed
+    lost: int  # holes in the numbering: written once, not in this file
+    gaps: tuple[Gap, ...]  # in time, where there is a rate; else where the numbering has holes
+    silence: Gap | None  # the longest time between two messages
+
+    @property
+    def whole(self) -> bool:
+        return not self.gaps and not self.lost
+
+
+@dc.dataclass
+class Integrity:
+    """Of one log. damage: what could not be read, in lines for people."""
+
+    damage: list[str]
+    finished: bool  # the program wrote its result
+    topics: list[TopicRow]
+    messages: int = 0
+    bytes: int = 0
+
+    @property
+    def lost(self) -> int:
+        return sum(row.lost for row in self.topics)
+
+    @property
+    def troubles(self) -> list[str]:
+        """All that is wrong with the file, in lines for people."""
+        if self.lost and not any("messages are missing" in line for line in self.damage):
+            return [*self.damage, f"{self.lost} messages are missing between others"]
+        return self.damage
+
+    @property
+    def late(self) -> list[TopicRow]:
+        return [row for row in self.topics if row.gaps]
+
+    @property
+    def sound(self) -> bool:
+        """Nothing that was written is missing."""
+        return not self.damage and not self.lost
+
+    def gaps(self) -> list[tuple[float, float]]:
+        """Spans of time in which the regular topics miss messages, merged."""
+        regular = [row for row in self.topics if row.period_s is not None and row.period_s <= SLOW]
+        out: list[tuple[float, float]] = []
+        for start, end in sorted((gap.start, gap.end) for row in regular for gap in row.gaps):
+            if out and start <= out[-1][1]:
+                out[-1] = (out[-1][0], max(out[-1][1], end))
+            else:
+                out.append((start, end))
+        return out
+
+
+def examine(log: LogReader) -> Integrity:
+    """Looks at every message's time and number; nothing is decoded."""
+    times: dict[str, list[int]] = {name: [] for name in log.topics}
+    numbers: dict[str, list[int]] = {name: [] for name in log.topics}
+    for record in log.records():
+        times[record.topic].append(record.when)
+        numbers[record.topic].append(record.sequence)
+    damage = list(log.damage)
+    if before := log.metadata.get("recovered", {}).get("damage"):
+        damage.append(f"recovered from a damaged log: {before}")
+    rows = [
+        _row(name, topic.schema, np.array(times[name]) / NANO, np.array(numbers[name]), log.start, log.end)
+        for name, topic in sorted(log.topics.items())
+    ]
+    count = sum(row.count for row in rows)
+    return Integrity(damage, "result" in log.metadata, rows, count, log.path.stat().st_size)
+
+
+def _row(topic: str, schema: str, time: np.ndarray, number: np.ndarray, start: float, end: float) -> TopicRow:
+    period = PERIODS.get(topic)
+    kind = "periodic" if period else "gated" if topic in GATED else "changes"
+    steps = np.diff(time)
+    holes = np.diff(np.concatenate([[-1], number])) - 1
+    lost = int(np.maximum(holes, 0).sum())
+    edges = np.concatenate([[start], time, [end]]) if len(time) else np.array([start, end])
+    if period is not None:
+        wide = np.flatnonzero(np.diff(edges) > LATE * period)
+        gaps = [Gap(float(edges[k]), float(edges[k + 1]), _between(edges, k, period)) for k in wide]
+    else:
+        gaps = [Gap(float(edges[k]), float(edges[k + 1]), int(holes[k])) for k in np.flatnonzero(holes > 0)]
+    silence = None
+    if len(steps):
+        k = int(steps.argmax())
+        silence = Gap(float(time[k]), float(time[k + 1]), 0)
+    median = float(np.median(steps)) if len(steps) else None
+    return TopicRow(topic, schema, len(time), kind, period, median, lost, tuple(gaps), silence)
+
+
+def _between(edges: np.ndarray, k: int, period: float) -> int:
+    """Messages that should be inside gap k; the first and last interval have a message at one end only."""
+    inside = round((edges[k + 1] - edges[k]) / period) - 1
+    return int(inside + (k == 0) + (k == len(edges) - 2))
+
+
+def words(row: TopicRow, most: int = 3) -> str:
+    """A topic's gaps for people."""
+    parts = [f"{gap.missing} in {gap.start:.3f}\u2013{gap.end:.3f} s" for gap in row.gaps[:most]]
+    if len(row.gaps) > most:
+        parts.append(f"{len(row.gaps) - most} more")
+    return ", ".join(parts)

@@ -1,0 +1,581 @@
+"""From a log to one HTML page that shows what happened: self-contained, nothing is loaded from anywhere.
+
+`review` reads a log into facts, `page` and `comparison_page` make HTML of them, `facts` gives the same to programs.
+"""
+
+import dataclasses as dc
+import html
+import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import yaml
+from markupsafe import Markup
+
+from valve_drake.analysis import two_logs
+from valve_drake.analysis.comparison import Divergence
+from valve_drake.analysis.integrity import Integrity, examine, words
+from valve_drake.analysis.metrics import Summary, summarize
+from valve_drake.analysis.pictures import Album, Moment
+from valve_drake.analysis.plots import LEFT, RIGHT, WIDTH, Line, Plot, nice_ticks
+from valve_drake.analysis.traces import ARMS, ModeSpan, Traces
+from valve_drake.messages import SIDES, Mode
+from valve_drake.recording.reader import LogReader
+from valve_drake.recording.signals import TORSO
+
+BLUE, ORANGE, GREEN, BLACK, GREY = "#0b62a8", "#d1500c", "#157f4c", "#1b1b1b", "#8a8f98"
+PURPLE, RED = "#7a3fa0", "#c1272d"
+SIDE_COLORS = dict(zip(SIDES, (BLUE, ORANGE)))
+AXES = tuple(zip("xyz", (RED, GREEN, BLUE)))
+AT_REST = (Mode.MEASURE, Mode.VERIFY)
+ROW = 22  # of the timeline [px]
+LONGEST = 48  # text of a value where two logs part [characters]
+
+
+@dc.dataclass
+class Review:
+    """Everything that is known of one log."""
+
+    log: LogReader
+    traces: Traces
+    integrity: Integrity
+    summary: Summary
+    run: dict[str, str]  # metadata `run` without the scenario
+    scenario_text: str
+    scenario: dict[str, Any]
+    recording: Path | None  # the 3D recording beside the log
+
+    @property
+    def name(self) -> str:
+        return self.log.path.name
+
+
+def review(path: str | os.PathLike) -> Review:
+    """Reads a log, whatever its state. Raises ConfigError if it is none."""
+    log = LogReader(path)
+    traces = Traces(log)
+    run = dict(log.metadata.get("run", {}))
+    text = run.pop("scenario", "")
+    recording = log.path.with_suffix(".html")
+    return Review(
+        log,
+        traces,
+        examine(log),
+        summarize(traces),
+        run,
+        text,
+        _parsed(text),
+        recording if recording.is_file() else None,
+    )
+
+
+def facts(found: Review) -> dict[str, Any]:
+    """The object of `review --json`."""
+    values = dc.asdict(found.summary)
+    spans = values.pop("spans")
+    values.pop("outcome")
+    topics = [
+        {"topic": r.topic, "schema": r.schema, "messages": r.count, "kind": r.kind, "period_s": r.period_s}
+        | {"median_period_s": r.median_s, "lost": r.lost, "gaps": [dc.asdict(gap) for gap in r.gaps]}
+        for r in found.integrity.topics
+    ]
+    out = {
+        "log": str(found.log.path),
+        "outcome": found.summary.outcome or "unfinished",
+        "sound": found.integrity.sound,
+        "finished": found.integrity.finished,
+        "damage": found.integrity.troubles,
+        "messages": found.integrity.messages,
+        "lost": found.integrity.lost,
+        "missing_topics": found.traces.missing,
+        **values,
+        "modes": spans,
+        "mode_durations_s": found.summary.mode_durations(),
+        "topics": topics,
+        "recording": str(found.recording) if found.recording else None,
+        "run": found.run,
+        "scenario": found.scenario,
+    }
+    return plain(out)
+
+
+@dc.dataclass
+class Comparison:
+    """Everything that is known of two logs side by side."""
+
+    a: Review
+    b: Review
+    modes: two_logs.Pairs
+    numbers: list[tuple[str, float | None, float | None, float | None]]  # name, of a, of b, difference
+    settings: list[tuple[str, Any, Any]]  # key, of a, of b
+    versions: list[tuple[str, Any, Any]]
+    topics: list[two_logs.TopicPair]
+
+    @property
+    def first(self) -> Divergence | None:
+        return two_logs.first_divergence(self.topics)
+
+    @property
+    def sound(self) -> bool:
+        return self.a.integrity.sound and self.b.integrity.sound
+
+
+def compare(a: Review, b: Review) -> Comparison:
+    """Two logs side by side."""
+    return Comparison(
+        a,
+        b,
+        two_logs.pair_modes(a.traces.spans, b.traces.spans),
+        two_logs.number_rows(a.summary, b.summary),
+        two_logs.settings(a.scenario, b.scenario),
+        [row for row in two_logs.settings(a.run, b.run) if row[0] not in (*a.scenario, *b.scenario)],
+        two_logs.compare_messages(a.log, b.log),
+    )
+
+
+def comparison_facts(found: Comparison) -> dict[str, Any]:
+    """The object of `review A B --json`."""
+    pairs = [
+        {"mode": (x or y).mode, "a_s": x.duration if x else None, "b_s": y.duration if y else None}
+        for x, y in found.modes
+    ]
+    out = {
+        "a": str(found.a.log.path),
+        "b": str(found.b.log.path),
+        "identical": found.first is None and found.sound,
+        "sound": found.sound,
+        "damage": {"a": found.a.integrity.troubles, "b": found.b.integrity.troubles},
+        "outcomes": {"a": found.a.summary.outcome or "unfinished", "b": found.b.summary.outcome or "unfinished"},
+        "verdicts": {"a": found.a.summary.verdict, "b": found.b.summary.verdict},
+        "first_divergence": _parting(found.first),
+        "modes": pairs,
+        "numbers": {name: {"a": x, "b": y, "difference": d} for name, x, y, d in found.numbers},
+        "settings": {key: {"a": x, "b": y} for key, x, y in found.settings + found.versions},
+        "topics": {
+            pair.topic: {"a": pair.count_a, "b": pair.count_b, "equal": pair.equal, "first": _parting(pair.first)}
+            for pair in found.topics
+        },
+    }
+    return plain(out)
+
+
+def _parting(found: Divergence | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {"time_s": found.time, "topic": found.topic, "field": found.field} | dict(zip("ab", parting_values(found)))
+
+
+def parting_values(found: Divergence) -> tuple[str | float | None, str | float | None]:
+    """What the two logs have where they part: numbers as they are, anything else as a short text, None for no message."""
+
+    def brief(value: Any) -> str | float | None:
+        if value is None or isinstance(value, int | float):
+            return value
+        text = value if isinstance(value, str) else " ".join(repr(value).split())
+        return text if len(text) <= LONGEST else text[: LONGEST - 1] + "\u2026"
+
+    return brief(found.recorded), brief(found.replayed)
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it: no NaN, no numpy."""
+    if isinstance(value, dict):
+        return {str(key): plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+# ---------------------------------------------------------------- the page
+
+
+def page(found: Review, beside: Path) -> str:
+    """The page of one log; links are relative to the folder `beside`."""
+    start, end = _extent(found.log)
+    spans = found.traces.spans
+    plots = [plot for plot in make_plots(found.traces) if plot.lines]
+    album = Album(found.log)
+    worst = _worst(found, album)
+    return _environment().get_template("review.html.j2").render(
+        title=f"{found.name}: {found.summary.verdict or found.summary.outcome or 'unfinished'}",
+        r=found,
+        s=found.summary,
+        integrity=found.integrity,
+        tiles=tiles(found.summary),
+        timeline=timeline(spans, start, end, found.integrity.gaps()),
+        plots=[(plot, plot.svg(spans, start, end)) for plot in plots],
+        missing=found.traces.missing,
+        spans=spans,
+        span=(start, end),
+        moments=album.changes_of_mode(spans),
+        worst=worst,
+        log_lines=_log_lines(found.log),
+        recording=os.path.relpath(found.recording, beside) if found.recording else None,
+        geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
+    )
+
+
+def make_plots(log: Traces) -> list[Plot]:
+    """All plots of a run; those without lines have nothing in this log."""
+    return [
+        _distance(log),
+        _position_error(log),
+        _angle_error(log),
+        _servo_error(log),
+        _servo_speed(log),
+        _forces(log),
+        _couple(log),
+        _angle(log),
+        _angle_difference(log),
+        _tracking(log),
+        _health(log),
+    ]
+
+
+def _distance(log: Traces) -> Plot:
+    lines = []
+    found = log.estimates
+    if found is not None and log.truth is not None and log.joints is not None:
+        time = log.joints.time[::8]
+        true = log.true_X_LV(time)
+        if true is not None:
+            lines.append(Line("true", time, np.linalg.norm(true[:, :, 3], axis=1), GREY))
+    if log.stereo is not None:
+        lines.append(Line("stage 1, stereo", *log.stereo, ORANGE, "rings"))
+    if found is not None and len(found.time):
+        lines.append(Line("stage 2, rectangle", found.time, found.distance, BLUE, "dots"))
+    return Plot("Distance of the marker", "m", lines, low=0.0, key="distance")
+
+
+NOMINAL = (
+    "Zero is the truth, taken through the nominal head kinematics: the true base and marker poses are recorded, the"
+    " head\u2019s mount and its small error are not, so a steady offset of a few millimetres is the mount\u2019s."
+    " Bands are the estimate\u2019s own 2 \u03c3."
+)
+
+
+def _position_error(log: Traces) -> Plot:
+    return _pose_error(log, "Marker position: estimate minus truth, in the left camera", "mm", 1e3, 3, NOMINAL, "position_error")
+
+
+def _angle_error(log: Traces) -> Plot:
+    note = "About the marker\u2019s own axes, modulo the half turn after which a rectangle looks the same."
+    return _pose_error(log, "Marker orientation: estimate minus truth", "deg", math.degrees(1), 0, note, "angle_error")
+
+
+def _pose_error(log: Traces, title: str, unit: str, scale: float, first: int, note: str, key: str) -> Plot:
+    found = log.estimates
+    lines = []
+    if found is not None and len(found.time) and np.isfinite(found.error).all():
+        for k, (axis, color) in enumerate(AXES):
+            error, sigma = scale * found.error[:, first + k], scale * found.sigma[:, first + k]
+            lines.append(Line(axis, found.time, error, color, "dots", sigma=sigma))
+    return Plot(title, unit, lines, note, height=190, knee=0.5 if first else 0.1, key=key)
+
+
+def _servo_error(log: Traces) -> Plot:
+    lines = _by_side(log.servo, "error", 1e3)
+    return Plot("Image servo: distance of each hand from its reference", "mm", lines, low=0.0, height=120, key="servo_error")
+
+
+def _servo_speed(log: Traces) -> Plot:
+    lines = _by_side(log.servo, "speed", 1e3)
+    return Plot("Image servo: speed of each hand, measured", "mm/s", lines, low=0.0, height=110, key="servo_speed")
+
+
+def _by_side(series: dict[str, np.ndarray] | None, what: str, scale: float) -> list[Line]:
+    if series is None:
+        return []
+    return [
+        Line(side, series["time"], scale * series[f"{side}_{what}"], SIDE_COLORS[side])
+        for side in SIDES
+        if f"{side}_{what}" in series
+    ]
+
+
+def _forces(log: Traces) -> Plot:
+    lines = []
+    if (turn := log.turn) is not None:
+        t = turn["time"]
+        lines = [Line(f"{side} hand", t, turn[f"force_{side}"], SIDE_COLORS[side]) for side in SIDES]
+        lines += [
+            Line("internal (squeeze)", t, turn["squeeze"], PURPLE),
+            Line("on the stem beyond the couple", t, turn["stem_force"], GREEN),
+        ]
+    note = "Magnitudes, without the hands\u2019 weight and the sensors\u2019 bias; the internal force is signed, positive compresses the bar."
+    return Plot("Forces on the hands", "N", lines, note, height=170, low=0.0, key="forces")
+
+
+def _couple(log: Traces) -> Plot:
+    lines = []
+    if (turn := log.turn) is not None:
+        t = turn["time"]
+        lines = [Line("couple on the valve", t, turn["torque"], BLACK)]
+        lines += [Line(f"moment at the {side} grip", t, turn[f"moment_{side}"], SIDE_COLORS[side]) for side in SIDES]
+    return Plot("Couple and moments", "N m", lines, height=130, low=0.0, key="couple")
+
+
+def _angle(log: Traces) -> Plot:
+    lines = []
+    scale = math.degrees(1)
+    if log.truth is not None:
+        lines.append(Line("true", log.truth.time, scale * log.truth.angle, GREY))
+    if log.turn is not None:
+        working = log.inside(log.turn["time"], Mode.GRASP, Mode.TURN, Mode.RELEASE)
+        t = log.turn["time"][working]
+        lines.append(Line("reference", t, scale * log.turn["angle_reference"][working], BLACK, dashed=True))
+        lines.append(Line("by the hands", t, scale * log.turn["angle"][working], ORANGE))
+    if log.camera_angle is not None:
+        time, angle = log.camera_angle
+        lines.append(Line("by the head cameras", time, scale * angle, BLUE, "dots"))
+    return Plot("Valve angle, positive opens", "deg", lines, height=170, key="valve_angle")
+
+
+def _angle_difference(log: Traces) -> Plot:
+    lines = []
+    scale = math.degrees(1)
+    if (truth := log.truth) is not None:
+        if log.turn is not None:
+            at = log.inside(log.turn["time"], Mode.TURN)
+            t = log.turn["time"][at]
+            zero = np.interp(t[:1], truth.time, truth.angle)
+            off = log.turn["angle"][at] - (np.interp(t, truth.time, truth.angle) - zero)
+            lines.append(Line("by the hands", t, scale * off, ORANGE))
+        if log.camera_angle is not None:
+            time, angle = log.camera_angle
+            seen = log.inside(time, Mode.MEASURE, Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE, Mode.VERIFY)
+            off = (angle - np.interp(time, truth.time, truth.angle))[seen]
+            lines.append(Line("by the head cameras", time[seen], scale * off, BLUE, "dots"))
+    return Plot("Valve angle: belief minus truth", "deg", lines, "From the measurement at rest on.", height=120, key="angle_error_valve")
+
+
+def _tracking(log: Traces) -> Plot:
+    groups = [("torso", TORSO, GREEN)] + [(f"{side} arm", ARMS[side], SIDE_COLORS[side]) for side in SIDES]
+    lines = []
+    if log.joints is not None:
+        for label, names, color in groups:
+            error = np.abs(log.joints.error(names))
+            if error.size and np.isfinite(error).all():
+                lines.append(Line(label, log.joints.time, 1e3 * error.max(axis=1), color))
+    return Plot("Joint tracking: largest difference of a group", "mrad", lines, low=0.0, height=130, key="tracking")
+
+
+def _health(log: Traces) -> Plot:
+    lines = []
+    if log.health is not None:
+        time, devices, ages = log.health
+        groups = (
+            ("head cameras", [d for d in devices if d.startswith("head")], BLUE),
+            ("wrist cameras", [d for d in devices if d.endswith("_wrist")], ORANGE),
+            ("all others", [d for d in devices if not d.startswith("head") and not d.endswith("_wrist")], GREEN),
+        )
+        for label, names, color in groups:
+            if names:
+                age = ages[:, [devices.index(name) for name in names]].max(axis=1)
+                lines.append(Line(label, time, age, color))
+    note = "A simulated station has no silent devices: zero throughout."
+    return Plot("Health: age of the oldest report of a group", "s", lines, note if _all_zero(lines) else "", height=96, low=0.0, high=0.1, key="health")
+
+
+def _all_zero(lines: Sequence[Line]) -> bool:
+    return all(not line.value.any() for line in lines)
+
+
+# ---------------------------------------------------------------- the page of two
+
+
+def comparison_page(found: Comparison, beside: Path) -> str:
+    """The page of two logs; links are relative to the folder `beside`."""
+    a, b = found.a, found.b
+    spans = a.traces.spans
+    start, end = _extent(a.log)
+    plots = overlaid(make_plots(a.traces), make_plots(b.traces), found.modes)
+    headline = {"modes", "estimates", "tracking", "mode_durations_s", "selector_limited", "selector_refused"}
+    main = [row for row in found.numbers if row[0].split(".")[0] not in headline]
+    return _environment().get_template("compare.html.j2").render(
+        title=f"{a.name} and {b.name}",
+        c=found,
+        a=a,
+        b=b,
+        first=found.first,
+        values=parting_values(found.first) if found.first else None,
+        parting_values=parting_values,
+        main=main,
+        others=[row for row in found.numbers if row not in main],
+        timelines=[timeline(r.traces.spans, *_extent(r.log), r.integrity.gaps()) for r in (a, b)],
+        plots=[(plot, plot.svg(spans, start, end)) for plot in plots],
+        spans=spans,
+        span=(start, end),
+        recordings=[os.path.relpath(r.recording, beside) if r.recording else None for r in (a, b)],
+        geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
+    )
+
+
+def overlaid(first: Sequence[Plot], second: Sequence[Plot], pairs: two_logs.Pairs) -> list[Plot]:
+    """The plots of the first run with the second's curves in paler colours, laid mode over mode."""
+    out = []
+    for plot, other in zip(first, second):
+        theirs = [
+            dc.replace(
+                line,
+                label=f"B: {line.label}",
+                time=two_logs.onto(pairs, line.time),
+                color=_paler(line.color),
+                dashed=line.style == "line",
+                sigma=None,
+            )
+            for line in other.lines
+        ]
+        ours = [dc.replace(line, label=f"A: {line.label}", sigma=None) for line in plot.lines]
+        if ours or theirs:
+            out.append(dc.replace(plot, lines=theirs + ours, note=""))
+    return out
+
+
+def _paler(color: str) -> str:
+    return "#" + "".join(f"{round(0.45 * int(color[k : k + 2], 16) + 0.55 * 255):02x}" for k in (1, 3, 5))
+
+
+def _extent(log: LogReader) -> tuple[float, float]:
+    return log.start, max(log.end, log.start + 1e-3)
+
+
+# ---------------------------------------------------------------- parts of the page
+
+
+def timeline(spans: Sequence[ModeSpan], start: float, end: float, gaps: Sequence[tuple[float, float]]) -> Markup:
+    """The modes as bars, a row for each, in the order of first entry; a last row for what is missing."""
+    if not spans:
+        return Markup("")
+    modes = list(dict.fromkeys(span.mode for span in spans))
+    left, right = 130, 10
+    height = ROW * (len(modes) + bool(gaps)) + 24
+
+    def x(time: float) -> float:
+        return left + (time - start) / (end - start) * (WIDTH - left - right)
+
+    out = [f'<svg class="gantt" viewBox="0 0 {WIDTH} {height}" role="img" aria-label="Modes over time">']
+    bottom = ROW * (len(modes) + bool(gaps))
+    for tick in nice_ticks(start, end, 10):
+        out.append(f'<line x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="0" y2="{bottom}"/>')
+        out.append(f'<text class="tick" x="{x(tick):.1f}" y="{bottom + 15}">{tick:g}</text>')
+    for row, mode in enumerate(modes):
+        middle = ROW * row + ROW / 2
+        out.append(f'<text class="name" x="{left - 8}" y="{middle + 4}">{html.escape(_label(mode))}</text>')
+        for span in (s for s in spans if s.mode == mode):
+            width = max(x(span.end) - x(span.start), 2.0)
+            words_ = f"{span.duration:.2f} s" + (f", retry {span.attempt}" if span.attempt else "")
+            hover = html.escape(f"{_label(mode)}: {span.start:.3f} to {span.end:.3f} s. {span.reason}")
+            out.append(
+                f'<g class="bar" data-start="{span.start:.4f}" data-end="{span.end:.4f}"><title>{hover}</title>'
+                f'<rect class="m-{mode} {"retry" if span.attempt else ""}" x="{x(span.start):.1f}" y="{middle - 8}" '
+                f'width="{width:.1f}" height="16" rx="2"/>{_bar_text(x(span.start), width, middle, words_)}</g>'
+            )
+    if gaps:
+        middle = ROW * len(modes) + ROW / 2
+        out.append(f'<text class="name bad" x="{left - 8}" y="{middle + 4}">missing</text>')
+        for a, b in gaps:
+            out.append(f'<rect class="gap" x="{x(a):.1f}" y="{middle - 8}" width="{max(x(b) - x(a), 2):.1f}" height="16"/>')
+    out.append("</svg>")
+    return Markup("".join(out))
+
+
+def _bar_text(x: float, width: float, middle: float, text: str) -> str:
+    """Behind the bar, before it where there is no room."""
+    if x + width + 7 * len(text) + 12 < WIDTH:
+        return f'<text class="time" x="{x + width + 6:.1f}" y="{middle + 4}">{text}</text>'
+    return f'<text class="time before" x="{x - 6:.1f}" y="{middle + 4}">{text}</text>'
+
+
+def tiles(s: Summary) -> list[tuple[str, str, str]]:
+    """(label, value, remark) of the numbers to see first."""
+    out: list[tuple[str, str, str]] = []
+
+    def add(label: str, value: Any, show: Callable[[Any], str], remark: str = "") -> None:
+        if value is not None:
+            out.append((label, show(value), remark))
+
+    degrees: Callable[[float], str] = lambda v: f"{round(math.degrees(v), 2) + 0.0:.2f}\u00b0"  # noqa: E731
+    add("commanded", s.command_rad, degrees)
+    add("seen by the cameras", s.angle_camera_rad, degrees, _off(s.angle_camera_rad, s.angle_true_rad))
+    add("felt by the hands", s.angle_hands_rad, degrees, _off(s.angle_hands_rad, s.angle_true_rad))
+    add("true", s.angle_true_rad, degrees, _off(s.angle_true_rad, s.command_rad, "command"))
+    add("simulated time" if s.angle_true_rad is not None else "time", s.sim_time_s, lambda v: f"{v:.1f} s")
+    add("retries", s.retries, str)
+    if s.turn_peak_torque_Nm is not None:
+        stem = f"on the stem beyond the couple: mean {s.turn_mean_stem_force_N:.1f} N, peak {s.turn_peak_stem_force_N:.1f} N"
+        add("peak force of a hand", s.turn_peak_hand_force_N, lambda v: f"{v:.1f} N", f"mean {s.turn_mean_hand_force_N:.1f} N")
+        add("couple", s.turn_mean_torque_Nm, lambda v: f"{v:.1f} N m", f"peak {s.turn_peak_torque_Nm:.1f} N m")
+        out.append(("load on the stem", f"{s.turn_mean_stem_force_N:.2f} N", f"peak {s.turn_peak_stem_force_N:.1f} N, beyond the couple"))
+        add("left hand\u2019s share", s.turn_share_left, lambda v: f"{100 * v:.1f} %", stem and "of the couple")
+    rest = s.estimates.get(Mode.MEASURE)
+    if rest is not None and rest.position_rms_m is not None:
+        add("pose measured at rest", rest.position_rms_m, lambda v: f"{1e3 * v:.2f} mm", f"{math.degrees(rest.angle_rms_rad):.2f}\u00b0 off, head mount included")
+    if s.servo_final_error_m:
+        worst = max(s.servo_final_error_m.values())
+        add("hands before the grasp", worst, lambda v: f"{1e3 * v:.2f} mm", "worse hand, by its own image")
+    return out
+
+
+def _off(value: float | None, other: float | None, name: str = "truth") -> str:
+    if value is None or other is None:
+        return ""
+    off = round(math.degrees(value - other), 2) + 0.0  # no negative zero
+    return f"{off:+.2f}\u00b0 to the {name}".replace("-", "\u2212")
+
+
+def _worst(found: Review, album: Album) -> Moment | None:
+    time = found.summary.worst_estimate_time_s
+    if time is None:
+        return None
+    estimates = found.traces.estimates
+    k = int(np.argmin(np.abs(estimates.time - time)))
+    error = 1e3 * np.linalg.norm(estimates.position_error[k])
+    what = f"{error:.1f} mm" if math.isfinite(error) else f"residual {estimates.residual_px[k]:.2f} px"
+    moment = album.moment(time, "worst estimate", f"{what} at a distance of {estimates.distance[k]:.2f} m")
+    return moment if moment.thumbnails else None
+
+
+def _log_lines(log: LogReader) -> list[tuple[float, str, str, int]]:
+    """(time, who, what, level) of /log."""
+    if "/log" not in log.topics:
+        return []
+    return [(t, m.name, m.message, m.level) for _, t, m in log.messages(["/log"]) if hasattr(m, "level")]
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    try:
+        out = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return {}
+    return out if isinstance(out, dict) else {}
+
+
+def _label(mode: str) -> str:
+    return mode.replace("_", " ")
+
+
+def _environment() -> jinja2.Environment:
+    loader = jinja2.PackageLoader("valve_drake", "analysis")
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+    environment.filters |= {"label": _label, "rate": _rate, "words": words, "size": _size}
+    environment.globals |= {"degrees": math.degrees, "AT_REST": AT_REST}
+    return environment
+
+
+def _rate(period: float | None) -> str:
+    if period is None or period <= 0:
+        return ""
+    return f"{1 / period:.4g} Hz"
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.0f} kB"

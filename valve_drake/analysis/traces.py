@@ -1,0 +1,339 @@
+"""From a log to time series: what the numbers (metrics.py) and the plots (report.py) are made of.
+
+Truth: what the simulation records at t is what was so one tick before (its block holds its outputs for a tick), and
+what it records at 0 is nothing yet; both are set right here. The true pose of the marker in the left head camera goes
+through the true base and marker, the measured torso and the *nominal* head: an error of the head's mount counts as an
+error of the estimate.
+"""
+
+import dataclasses as dc
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from valve_drake.checks import ConfigError
+from valve_drake.frames import compose, inverse, make, planar, rot_z, rotation_vector, wrap
+from valve_drake.kinematics import GEOMETRY
+from valve_drake.messages import SIDES, Mode
+from valve_drake.ports import TICK
+from valve_drake.recording.reader import LogReader
+from valve_drake.recording.signals import TORSO
+
+ARMS = {side: tuple(f"{side}_arm_{k}" for k in range(1, 7)) for side in SIDES}
+HALF_TURN = make(rot_z(np.pi), np.zeros(3))
+
+
+@dc.dataclass(frozen=True)
+class ModeSpan:
+    """One stay in a mode. `reason` is why it was entered, `attempt` counts the entries before it."""
+
+    mode: str
+    activation: int
+    start: float  # [s]
+    end: float
+    reason: str
+    attempt: int = 0
+
+    @property
+    def duration(self) -> float:
+        return self.end - self.start
+
+
+@dc.dataclass(frozen=True)
+class Estimates:
+    """Stage 2, one row for each image pair in which the marker was found.
+
+    Errors are estimate minus truth: `angle_error` (N, 3) about the axes of V, modulo the half turn after which the
+    rectangle looks the same; `position_error` (N, 3) along those of L. NaN without truth.
+    """
+
+    time: np.ndarray  # of capture (N,) [s]
+    X_LV: np.ndarray  # (N, 3, 4)
+    X_OV: np.ndarray
+    covariance: np.ndarray  # (N, 6, 6) [rad^2, m^2]
+    residual_px: np.ndarray
+    cameras: np.ndarray
+    angle_error: np.ndarray  # [rad]
+    position_error: np.ndarray  # [m]
+    looked: int  # images pairs looked at, found or not
+
+    @property
+    def distance(self) -> np.ndarray:
+        return np.linalg.norm(self.X_LV[:, :, 3], axis=1)
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviations: about x, y, z of V [rad], along x, y, z of L [m] -> (N, 6)."""
+        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
+
+    @property
+    def error(self) -> np.ndarray:
+        """[angle; position], in the order of the covariance -> (N, 6)."""
+        return np.hstack([self.angle_error, self.position_error])
+
+
+@dc.dataclass(frozen=True)
+class Joints:
+    """Measured and commanded joints on the instants of the measured ones. The names are those of the log."""
+
+    time: np.ndarray  # (N,) [s]
+    names: tuple[str, ...]
+    position: np.ndarray  # (N, J) [rad], [m]
+    velocity: np.ndarray
+    commanded: np.ndarray  # (N, J) positions; NaN where none is commanded
+
+    def index(self, names: tuple[str, ...]) -> list[int]:
+        return [self.names.index(name) for name in names if name in self.names]
+
+    def error(self, names: tuple[str, ...]) -> np.ndarray:
+        """Commanded minus measured -> (N, len(names))."""
+        at = self.index(names)
+        return self.commanded[:, at] - self.position[:, at]
+
+
+@dc.dataclass(frozen=True)
+class Truth:
+    """What only a simulation knows, each row at the instant when it was so."""
+
+    time: np.ndarray  # (N,) [s]
+    base: np.ndarray  # x, y [m], heading [rad] in W, continuous (N, 3)
+    X_WV: np.ndarray  # (N, 3, 4)
+    angle: np.ndarray  # turned since the start, positive opens (N,) [rad]
+
+
+class Traces:
+    """The time series of one log, each read when it is first asked for. None or empty: the log does not have it.
+
+    missing: topics that could not be read, with the reason.
+    """
+
+    def __init__(self, reader: LogReader):
+        self.reader = reader
+        self.missing: dict[str, str] = {}
+
+    def inside(self, time: np.ndarray, *modes: str) -> np.ndarray:
+        """Which of these instants fall into one of the modes -> (N,) bool."""
+        found = np.zeros(len(time), bool)
+        for span in self.spans:
+            if span.mode in modes:
+                found |= (time > span.start) & (time <= span.end)
+        return found
+
+    @cached_property
+    def modes(self) -> list[Any]:
+        """The supervisor's messages."""
+        return [mode for _, mode in self._messages("/supervisor/mode")]
+
+    @cached_property
+    def spans(self) -> list[ModeSpan]:
+        """The stays in modes, in order."""
+        starts: list[Any] = []
+        for mode in self.modes:
+            if not starts or starts[-1].activation != mode.activation:
+                starts.append(mode)
+        ends = [mode.since for mode in starts[1:]] + [self.reader.end]
+        return [ModeSpan(m.mode, m.activation, m.since, end, m.reason, m.attempt) for m, end in zip(starts, ends)]
+
+    @cached_property
+    def joints(self) -> Joints | None:
+        states, commands = self._messages("/joint_states"), self._messages("/joint_commands")
+        if not states:
+            return None
+        names = tuple(joint.name for joint in states[0][1].joints)
+        table = np.array([[(j.position, j.velocity) for j in m.joints] for _, m in states])
+        time = np.array([t for t, _ in states])
+        commanded = np.full(table.shape[:2], np.nan)
+        if commands:
+            known = [joint.name for joint in commands[0][1].joints]
+            asked = np.array([[j.position for j in m.joints] for _, m in commands])
+            when = np.array([t for t, _ in commands])
+            before = np.clip(np.searchsorted(when, time, side="right") - 1, 0, None)
+            for k, name in enumerate(names):
+                if name in known and not name.startswith("base"):  # the base is commanded by speed
+                    commanded[:, k] = asked[before, known.index(name)]
+        return Joints(time, names, table[:, :, 0], table[:, :, 1], commanded)
+
+    @cached_property
+    def truth(self) -> Truth | None:
+        topics = ("/truth/base_pose", "/truth/marker_pose", "/truth/valve_angle")
+        rows = [{t: m.values for t, m in self._messages(topic) if t >= TICK} for topic in topics]
+        when = sorted(set(rows[0]) & set(rows[1]) & set(rows[2]))
+        if not when:
+            return None
+        time = np.array(when)
+        base, marker, angle = (np.array([found[t] for t in when]) for found in rows)
+        base = np.column_stack([base[:, :2], np.unwrap(base[:, 2])])
+        return Truth(time - TICK, base, marker.reshape(-1, 3, 4), angle[:, 0] - angle[0, 0])
+
+    @cached_property
+    def estimates(self) -> Estimates | None:
+        every = [m for _, m in self._messages("/rectangle_estimator/estimate") if m.sequence >= 0]
+        if not every:
+            return None
+        rows = [m for m in every if m.found]
+        time = np.array([m.time for m in rows])
+        X_LV = np.array([m.X_LV for m in rows]).reshape(-1, 3, 4)
+        errors = self._errors(time, X_LV)
+        return Estimates(
+            time,
+            X_LV,
+            np.array([compose(m.X_OL, m.X_LV) for m in rows]).reshape(-1, 3, 4),
+            np.array([m.covariance for m in rows]).reshape(-1, 6, 6),
+            np.array([m.residual_px for m in rows]),
+            np.array([m.cameras for m in rows]),
+            errors[:, :3],
+            errors[:, 3:],
+            len(every),
+        )
+
+    def true_X_LV(self, time: np.ndarray) -> np.ndarray | None:
+        """The marker in the (nominal) left head camera at these instants -> (N, 3, 4); None without truth."""
+        truth, joints = self.truth, self.joints
+        if truth is None or joints is None or len(joints.index(TORSO)) < len(TORSO):
+            return None
+        base = interpolate(time, truth.time, truth.base)
+        marker = interpolate(time, truth.time, truth.X_WV)
+        torso = interpolate(time, joints.time, joints.position[:, joints.index(TORSO)])
+        heads = (compose(planar(*b), GEOMETRY.X_BL(q)) for b, q in zip(base, torso))
+        return np.array([compose(inverse(X_WL), X_WV) for X_WL, X_WV in zip(heads, marker)]).reshape(-1, 3, 4)
+
+    def _errors(self, time: np.ndarray, X_LV: np.ndarray) -> np.ndarray:
+        true = self.true_X_LV(time)
+        if true is None:
+            return np.full((len(time), 6), np.nan)
+        errors = []
+        for X, Y in zip(X_LV, true):
+            R = Y[:, :3].T @ X[:, :3]
+            angles = min((rotation_vector(R), rotation_vector(R @ HALF_TURN[:, :3])), key=np.linalg.norm)
+            errors.append(np.concatenate([angles, X[:, 3] - Y[:, 3]]))
+        return np.array(errors).reshape(-1, 6)
+
+    @cached_property
+    def stereo(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Stage 1: times of capture and distances where the marker was found."""
+        rows = [m for _, m in self._messages("/stereo_positioning/position") if m.found]
+        if not rows:
+            return None
+        return np.array([m.time for m in rows]), np.array([np.linalg.norm(m.p_LV) for m in rows])
+
+    @cached_property
+    def turn(self) -> dict[str, np.ndarray] | None:
+        """Stage 5 as recorded; forces and moments as magnitudes."""
+        names = ("stage", "angle", "angle_reference", "torque", "share_left", "squeeze")
+        vectors = ("force_left", "force_right", "moment_left", "moment_right", "stem_force")
+        rows = [(t, m) for t, m in self._messages("/hybrid_rotation/turn") if m.stage]
+        if not rows:
+            return None
+        out = {name: np.array([getattr(m, name) for _, m in rows]) for name in names}
+        out |= {name: np.linalg.norm([getattr(m, name) for _, m in rows], axis=1) for name in vectors}
+        return out | {"time": np.array([t for t, _ in rows])}
+
+    @cached_property
+    def camera_angle(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """How far the valve has turned since it was measured, by the head cameras: times of capture, angles.
+
+        A rectangle looks the same after half a turn: which of the two it is, the hands' angle says.
+        """
+        found = self.estimates
+        if found is None or len(found.time) == 0:
+            return None
+        R = np.einsum("ji,njk->nik", found.X_OV[0, :, :3], found.X_OV[:, :, :3])
+        raw = -np.arctan2(R[:, 1, 0], R[:, 0, 0])
+        measured = self.inside(found.time, Mode.MEASURE)
+        zero = raw[measured][-1] if measured.any() else 0.0
+        if self.turn is None:
+            angle = np.unwrap(raw - zero, period=np.pi)
+        else:
+            hands = np.interp(found.time, self.turn["time"], self.turn["angle"], left=0.0)
+            angle = np.array([h + wrap(a - zero - h, np.pi) for a, h in zip(raw, hands)])
+        return found.time, angle - (np.mean(angle[measured]) if measured.any() else 0.0)
+
+    @cached_property
+    def servo(self) -> dict[str, np.ndarray] | None:
+        """Stage 4 while it is at work: distances from the reference [m] and the hands' measured speeds [m/s]."""
+        rows = self._messages("/image_servo/servo")
+        working = self.inside(np.array([t for t, _ in rows]), Mode.SERVO)
+        rows = [row for row, at_work in zip(rows, working) if at_work]
+        if not rows:
+            return None
+        out = {"time": np.array([t for t, _ in rows])}
+        for side in SIDES:
+            out[f"{side}_error"] = np.array([np.linalg.norm(getattr(m, f"{side}_error")) for _, m in rows])
+            if self.joints is not None and len(self.joints.index(ARMS[side])) == 6:
+                at = self.joints.index(ARMS[side])
+                q = interpolate(out["time"], self.joints.time, self.joints.position[:, at])
+                v = interpolate(out["time"], self.joints.time, self.joints.velocity[:, at])
+                J = (GEOMETRY.arm_jacobian(row, side)[3:] for row in q)
+                out[f"{side}_speed"] = np.array([np.linalg.norm(j @ row) for j, row in zip(J, v)])
+        return out
+
+    @cached_property
+    def reports(self) -> list[tuple[float, Any]]:
+        """The station's health messages with their times."""
+        return self._messages("/health")
+
+    @cached_property
+    def health(self) -> tuple[np.ndarray, tuple[str, ...], np.ndarray] | None:
+        """Times, devices, ages (N, D) [s]."""
+        rows = [(t, m) for t, m in self.reports if m.devices]
+        if not rows:
+            return None
+        devices = rows[-1][1].devices
+        rows = [(t, m) for t, m in rows if m.devices == devices]
+        return np.array([t for t, _ in rows]), devices, np.array([m.ages for _, m in rows])
+
+    @cached_property
+    def faults(self) -> list[tuple[float, str]]:
+        """When which fault was first reported."""
+        out, before = [], set()
+        for time, health in self.reports:
+            now = set(health.faults) | ({"emergency stop"} if health.estop else set())
+            out += [(time, fault) for fault in sorted(now - before)]
+            before = now
+        return out
+
+    @cached_property
+    def selector(self) -> dict[str, dict[str, int]] | None:
+        """command_selector's ticks by what it did: "limited", "refused", "tripped" -> name -> ticks."""
+        rows = self._messages("/command_selector/report")
+        if not rows:
+            return None
+        out: dict[str, dict[str, int]] = {"limited": {}, "refused": {}, "tripped": {}}
+        for _, report in rows:
+            for did, count in out.items():
+                for name in getattr(report, did):
+                    count[name] = count.get(name, 0) + 1
+        return out
+
+    @cached_property
+    def verify_angle(self) -> float | None:
+        """What the camera saw after letting go [rad]."""
+        verifying = {span.activation for span in self.spans if span.mode == Mode.VERIFY}
+        angle = None
+        for _, status in self._messages("/kinematic_approach/status"):
+            if status.activation in verifying and status.state in ("succeeded", "failed") and status.progress == 1.0:
+                angle = status.value
+        return angle
+
+    def _messages(self, topic: str) -> list[tuple[float, Any]]:
+        """(time, message) of a topic; none if it is not there or from another version of the program."""
+        if topic not in self.reader.topics or self.reader.topics[topic].count == 0:
+            self.missing.setdefault(topic, "not in this log")
+            return []
+        try:
+            rows = [(time, message) for _, time, message in self.reader.messages([topic])]
+        except ConfigError as error:
+            self.missing[topic] = str(error)
+            return []
+        return rows
+
+
+def interpolate(time: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Rows of `values` (N, ...), known at `at`, at other instants, linearly -> (len(time), ...)."""
+    k = np.clip(np.searchsorted(at, time) - 1, 0, max(len(at) - 2, 0))
+    after = np.minimum(k + 1, len(at) - 1)
+    step = at[after] - at[k]
+    share = np.clip((time - at[k]) / np.where(step > 0, step, 1.0), 0.0, 1.0)
+    share = share.reshape(-1, *[1] * (values.ndim - 1))
+    return values[k] * (1 - share) + values[after] * share

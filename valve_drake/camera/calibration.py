@@ -1,0 +1,679 @@
+"""Calibration of one camera, of the stereo head, and of a camera on a hand, from images of a chessboard.
+
+Zhang's method: OpenCV gives the start, one bundle adjustment (Levenberg-Marquardt, analytic Jacobian) ends it for both
+lens models, so that both are judged on the same corners:
+
+    opencv  K and the distortion k1, k2, p1, p2, k3
+    paper   eq. (1), (2): k_x, k_y, u_0, v_0, k_u, k_v
+
+The root mean square of the residuals does not tell whether a calibration is good. What does: the standard deviations,
+and `split_half`, the difference of points triangulated by two calibrations from every second view.
+
+Frames: L, R cameras; C one camera; T board; B robot base, E hand. Lengths in m, pixels as in lens.py.
+"""
+
+import dataclasses as dc
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from valve_drake import frames
+from valve_drake.camera.board import Board
+from valve_drake.camera.lens import Lens, LensModel, OpenCvLens, StereoHead
+from valve_drake.checks import ConfigError
+
+KINDS = ("opencv", "paper")
+RANGES = (0.5, 1.0, 2.0)  # at which points are triangulated [m]
+MIN_VIEWS = 3
+_MAX_FOCAL_SIGMA = 0.02  # a focal length known less well than this (relative) is none
+_MIN_TILT = math.radians(8)  # between the steepest boards: less does not tell the focal length from the distance
+_OUTLIER = 2.5  # times the median view's rms
+
+
+@dc.dataclass(frozen=True)
+class View:
+    """The corners of one board, in one or two cameras.
+
+    Views with the same `body` are one rigid target (boards at known distances): `points` are in its frame.
+    """
+
+    names: tuple[str, ...]  # of the images, one for each camera
+    points: np.ndarray  # (n, 3) [m]
+    px: tuple[np.ndarray, ...]  # (n, 2) for each camera
+    body: int
+
+
+@dc.dataclass(frozen=True)
+class Fit:
+    """One lens model fitted to all views."""
+
+    kind: str
+    lenses: tuple[LensModel, ...]
+    X_LR: np.ndarray | None  # (3, 4), stereo only
+    poses: tuple[np.ndarray, ...]  # X_LT of each body
+    rms: float  # over corners, sqrt(mean(du^2 + dv^2)) as OpenCV has it [px]
+    covariance: np.ndarray  # (G, G) of what all views share: the lenses, then (theta, p) of X_LR
+    residuals: tuple[tuple[np.ndarray, ...], ...]  # [view][camera] -> (n, 2) predicted - seen [px]
+    names: tuple[str, ...]  # of the G shared parameters
+
+    def head(self) -> StereoHead:
+        """The stereo head. With one camera both sides are that camera and X_LR is the identity."""
+        X_LR = np.eye(3, 4) if self.X_LR is None else self.X_LR
+        return StereoHead(self.lenses[0], self.lenses[-1], X_LR, rms_px=self.rms)
+
+    def view_rms(self) -> np.ndarray:
+        """(views, cameras) [px]."""
+        return np.array([[_rms(r) for r in view] for view in self.residuals])
+
+    def outliers(self) -> list[int]:
+        """Views whose residuals stand out from the median view's."""
+        rms = np.sqrt((self.view_rms() ** 2).mean(1))
+        return [k for k, value in enumerate(rms) if value > _OUTLIER * np.median(rms)]
+
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviation of each shared parameter."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist()))
+
+
+@dc.dataclass(frozen=True)
+class Calibration:
+    """Both lens models on the same corners; `fit` is the chosen one."""
+
+    fit: Fit
+    other: Fit
+    better: str  # the kind that explains the corners better for its number of parameters
+    views: tuple[View, ...]
+    split_half: dict[float, float] | None  # range [m] -> difference [m], stereo only
+    depth_sigma: dict[float, float]  # range [m] -> standard deviation by the covariance [m], stereo only
+    pitch: tuple[float, float] | None  # triangulated pitch over the true one: mean, standard deviation
+
+
+# ---------------------------------------------------------------- lens models with their derivatives
+
+
+class _OpenCvKind:
+    """`free` distortion coefficients of k1, k2, p1, p2, k3; the others stay 0."""
+
+    def __init__(self, free: Sequence[int]):
+        self.free = list(free)
+        self.names = ("fx", "fy", "cx", "cy", *(("k1", "k2", "p1", "p2", "k3")[k] for k in self.free))
+
+    def start(self, K: np.ndarray, dist: np.ndarray) -> np.ndarray:
+        return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *dist[self.free]])
+
+    def lens(self, p: np.ndarray, size: tuple[int, int]) -> OpenCvLens:
+        dist = np.zeros(5)
+        dist[self.free] = p[4:]
+        return OpenCvLens(np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1]]), dist, *size)
+
+    def project(self, lens: OpenCvLens, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """px (n, 2), d px / d xy (n, 2, 2), d px / d parameters (n, 2, m)."""
+        points = np.column_stack([xy, np.ones(len(xy))])
+        px, J = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.K, lens.dist)
+        J = J.reshape(len(xy), 2, -1)  # rvec, tvec, f, c, dist
+        return px[:, 0], J[:, :, 3:5], J[:, :, [6, 7, 8, 9, *(10 + k for k in self.free)]]
+
+
+class _PaperKind:
+    names = ("k_x", "k_y", "u_0", "v_0", "k_u", "k_v")
+
+    def start(self, K: np.ndarray, dist: np.ndarray) -> np.ndarray:
+        k = -dist[0] / (K[0, 0] * K[1, 1])  # eq. (1) is the inverse of OpenCV's k1, to first order
+        return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], k, k])
+
+    def lens(self, p: np.ndarray, size: tuple[int, int]) -> Lens:
+        k_x, k_y, u_0, v_0, k_u, k_v = map(float, p)
+        return Lens(k_u, k_v, k_x, k_y, u_0, v_0, *size)
+
+    def project(self, lens: Lens, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """By the implicit function: normalize(px; parameters) = xy."""
+        px = lens.project(xy)
+        A = np.linalg.inv(lens.normalize_jacobian(px))
+        d = px - [lens.u_0, lens.v_0]
+        r2 = (d * d).sum(-1)
+        J = np.zeros((len(xy), 2, 6))
+        J[:, :, 0], J[:, :, 1] = A[:, :, 0] * (xy[:, :1] / lens.k_x), A[:, :, 1] * (xy[:, 1:] / lens.k_y)
+        J[:, 0, 2] = J[:, 1, 3] = 1.0
+        J[:, :, 4] = A[:, :, 0] * (-d[:, 0] * r2 / lens.k_x)[:, None]
+        J[:, :, 5] = A[:, :, 1] * (-d[:, 1] * r2 / lens.k_y)[:, None]
+        return px, A, J
+
+
+# ---------------------------------------------------------------- bundle adjustment
+
+
+@dc.dataclass(frozen=True)
+class _State:
+    lenses: tuple[np.ndarray, ...]  # parameters of each
+    X_LR: np.ndarray | None
+    poses: tuple[np.ndarray, ...]
+
+
+class _Problem:
+    """Sum of squares of all corners' residuals, as a function of the lenses, X_LR and the bodies' poses."""
+
+    def __init__(self, views: Sequence[View], kind: Any, size: tuple[int, int]):
+        self.views, self.kind, self.size = views, kind, size
+        self.cameras = len(views[0].px)
+        self.bodies = max(view.body for view in views) + 1
+        self.m = len(kind.names)
+        self.shared = self.m * self.cameras + (6 if self.cameras == 2 else 0)
+
+    def __call__(self, state: _State) -> tuple[float, np.ndarray, np.ndarray, list[list[np.ndarray]]]:
+        """Cost, its Gauss-Newton Hessian and gradient (halved), and the residuals."""
+        n = self.shared + 6 * self.bodies
+        H, g, cost, residuals = np.zeros((n, n)), np.zeros(n), 0.0, []
+        lenses = [self.kind.lens(p, self.size) for p in state.lenses]
+        for view in self.views:
+            X_LT = state.poses[view.body]
+            P = frames.apply(X_LT, view.points)
+            dP = np.concatenate([-X_LT[:, :3] @ _skew(view.points), np.broadcast_to(np.eye(3), (len(P), 3, 3))], 2)
+            mine = slice(self.shared + 6 * view.body, self.shared + 6 * view.body + 6)
+            residuals.append([])
+            for c, (lens, px) in enumerate(zip(lenses, view.px)):
+                Q, dQ, dX = P, dP, None
+                if c == 1:
+                    R = state.X_LR[:, :3]
+                    Q, dQ = (P - state.X_LR[:, 3]) @ R, R.T @ dP
+                    dX = np.concatenate([_skew(Q), np.broadcast_to(-R.T, (len(Q), 3, 3))], 2)
+                if not (Q[:, 2] > 1e-6).all():
+                    return math.inf, H, g, residuals
+                xy = Q[:, :2] / Q[:, 2:]
+                seen, D, own = self.kind.project(lens, xy)
+                D = D @ (np.concatenate([np.broadcast_to(np.eye(2), (len(Q), 2, 2)), -xy[:, :, None]], 2) / Q[:, 2, None, None])
+                r = seen - px
+                columns = [np.arange(c * self.m, (c + 1) * self.m), np.arange(mine.start, mine.stop)]
+                blocks = [own, D @ dQ]
+                if dX is not None:
+                    columns.append(np.arange(self.shared - 6, self.shared))
+                    blocks.append(D @ dX)
+                at = np.concatenate(columns)
+                J = np.concatenate(blocks, 2).reshape(-1, len(at))
+                H[np.ix_(at, at)] += J.T @ J
+                g[at] += J.T @ r.ravel()
+                cost += float((r * r).sum())
+                residuals[-1].append(r)
+        return (cost if np.isfinite(cost) else math.inf), H, g, residuals
+
+    def moved(self, state: _State, step: np.ndarray) -> _State:
+        lenses = tuple(p + step[c * self.m : (c + 1) * self.m] for c, p in enumerate(state.lenses))
+        X_LR = _moved(state.X_LR, step[self.shared - 6 : self.shared]) if self.cameras == 2 else None
+        poses = step[self.shared :].reshape(-1, 6)
+        return _State(lenses, X_LR, tuple(_moved(X, s) for X, s in zip(state.poses, poses)))
+
+    def names(self) -> tuple[str, ...]:
+        if self.cameras == 1:
+            return self.kind.names
+        out = [f"{side}.{name}" for side in ("left", "right") for name in self.kind.names]
+        return (*out, *(f"X_LR.{name}" for name in ("theta_x", "theta_y", "theta_z", "p_x", "p_y", "p_z")))
+
+
+def _minimize(problem: Callable, state: Any, moved: Callable, steps: int = 200) -> tuple[Any, tuple]:
+    """Levenberg-Marquardt from `state` until no step is expected to matter -> the best state, problem(state)."""
+    at = problem(state)
+    if not math.isfinite(at[0]):
+        raise ConfigError("the calibration has no start: a board lies behind a camera")
+    damping = 1e-4
+    for _ in range(steps):
+        cost, H, g = at[:3]
+        scale = np.sqrt(np.diag(H)) + 1e-150  # a lens's k_u is 1e-7, its k_x 1e3
+        scaled, slope = H / np.outer(scale, scale), g / scale
+        step = -np.linalg.solve(scaled + damping * np.eye(len(g)), slope)
+        gain = -2 * (slope @ step) - step @ scaled @ step
+        trial_state = moved(state, step / scale)
+        trial = problem(trial_state)
+        if trial[0] <= cost:
+            state, at, damping = trial_state, trial, max(damping / 10, 1e-12)
+        else:
+            damping = max(damping * 10, 1e-9)
+        if gain <= 1e-12 * cost + 1e-24 or damping > 1e10:
+            break
+    return state, at
+
+
+def _solve(views: Sequence[View], kind: Any, name: str, start: _State, size: tuple[int, int]) -> Fit:
+    problem = _Problem(views, kind, size)
+    state, (cost, H, _, residuals) = _minimize(problem, start, problem.moved)
+    corners = sum(len(r) for view in residuals for r in view)
+    scale = np.sqrt(np.diag(H)) + 1e-150
+    # A direction that the corners do not see shows as a huge deviation instead of an error.
+    inverse = np.linalg.pinv(H / np.outer(scale, scale), rcond=1e-15, hermitian=True) / np.outer(scale, scale)
+    covariance = inverse[: problem.shared, : problem.shared] * cost / max(2 * corners - len(H), 1)
+    return Fit(
+        kind=name,
+        lenses=tuple(kind.lens(p, size) for p in state.lenses),
+        X_LR=state.X_LR,
+        poses=state.poses,
+        rms=math.sqrt(cost / corners),
+        covariance=covariance,
+        residuals=tuple(tuple(view) for view in residuals),
+        names=problem.names(),
+    )
+
+
+# ---------------------------------------------------------------- intrinsics and stereo
+
+
+def board_views(
+    board: Board,
+    names: Sequence[tuple[str, ...]],
+    corners: Sequence[tuple[np.ndarray | None, ...]],
+    distances: Sequence[float] | None = None,
+) -> list[View]:
+    """Views of those boards that every camera found; with distances [m] all of them are one rigid target."""
+    views = []
+    for k, (name, px) in enumerate(zip(names, corners)):
+        if any(one is None for one in px):
+            continue
+        points, body = board.points(), len(views)
+        if distances is not None:
+            points, body = points + [0, 0, distances[k] - np.mean(distances)], 0
+        views.append(View(name, points, px, body))
+    return views
+
+
+def calibrate(views: Sequence[View], size: tuple[int, int], kind: str = "opencv", board: Board | None = None) -> Calibration:
+    """One camera or the stereo head (as many cameras as the views have), `size` = width, height [px].
+
+    kind: opencv, paper, or best (the better of the two). Raises ConfigError for views that do not determine a camera.
+    """
+    rigid = len(views) > 1 and views[0].body == views[-1].body
+    least = 2 if rigid else MIN_VIEWS
+    if len(views) < least:
+        raise ConfigError(f"{len(views)} usable view(s) of the board: a calibration needs at least {least}")
+    # Boards that are all frontal show little of a lens: what they cannot tell must not be fitted.
+    kinds = {"opencv": _OpenCvKind([0] if rigid else range(5)), "paper": _PaperKind()}
+    fits = {}
+    start = _start(views, size, kinds["opencv"], rigid)
+    for name, model in kinds.items():
+        lenses = tuple(model.start(K, dist) for K, dist in start[0])
+        try:
+            fits[name] = _solve(views, model, name, _State(lenses, *start[1:]), size)
+        except np.linalg.LinAlgError as error:
+            raise ConfigError("the boards do not determine a camera: show them tilted, to all sides") from error
+    _refuse_degenerate(fits["opencv"], rigid)
+    better = min(fits, key=lambda name: _information(fits[name]))
+    fit = fits[better if kind == "best" else kind]
+    for side, lens in zip(("left", "right"), fit.lenses):
+        lens.check(side if len(fit.lenses) == 2 else "camera")
+    stereo = fit.X_LR is not None
+    return Calibration(
+        fit=fit,
+        other=fits[KINDS[1 - KINDS.index(fit.kind)]],
+        better=better,
+        views=tuple(views),
+        split_half=_split_half(fit, views, kinds[fit.kind], size, least) if stereo else None,
+        depth_sigma=_depth_sigma(fit, kinds[fit.kind], size) if stereo else {},
+        pitch=_pitch(fit, views, board) if stereo and board else None,
+    )
+
+
+def _start(
+    views: Sequence[View], size: tuple[int, int], kind: _OpenCvKind, rigid: bool
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray | None, tuple[np.ndarray, ...]]:
+    """OpenCV's answer for each camera alone, then for both -> (K, dist) of each, X_LR, X_LT of each body."""
+    groups = [[view for view in views if view.body == b] for b in range(views[-1].body + 1)]
+    points = [np.vstack([view.points for view in group]).astype(np.float32) for group in groups]
+    flags = 0
+    for k, name in ((0, "K1"), (1, "K2"), (4, "K3")):
+        flags |= 0 if k in kind.free else getattr(cv2, f"CALIB_FIX_{name}")
+    flags |= 0 if 2 in kind.free else cv2.CALIB_ZERO_TANGENT_DIST
+    alone, seen = [], []
+    for c in range(len(views[0].px)):
+        px = [np.vstack([view.px[c] for view in group]).astype(np.float32) for group in groups]
+        # A target with depth needs a first guess of K; the best of a few will do for any lens.
+        guesses = [f * size[0] for f in (0.7, 1.4, 2.8)] if rigid else [None]
+        best = None
+        for guess in guesses:
+            K, more = None, 0
+            if guess is not None:
+                K, more = np.array([[guess, 0, (size[0] - 1) / 2], [0, guess, (size[1] - 1) / 2], [0, 0, 1.0]]), 1
+            try:
+                found = cv2.calibrateCameraExtended(
+                    points, px, size, K, np.zeros(5), flags=flags | (cv2.CALIB_USE_INTRINSIC_GUESS if more else 0)
+                )
+            except cv2.error:
+                continue
+            if np.isfinite(found[0]) and (best is None or found[0] < best[0]):
+                best = found
+        if best is None:
+            raise ConfigError("the boards do not determine a camera: show them tilted, to all sides")
+        alone.append((best[1], best[2].ravel(), best[3], best[4]))
+        seen.append(px)
+    lenses = [(K, dist) for K, dist, _, _ in alone]
+    poses = tuple(_transform(r, t) for r, t in zip(*alone[0][2:]))
+    if len(alone) == 1:
+        return lenses, None, poses
+    (K0, d0), (K1, d1) = lenses
+    R, t = np.eye(3), np.zeros(3)
+    both = cv2.stereoCalibrateExtended(
+        points, seen[0], seen[1], K0, d0, K1, d1, size, R, t, flags=cv2.CALIB_FIX_INTRINSIC
+    )
+    return lenses, frames.inverse(frames.make(both[5], both[6].ravel())), poses
+
+
+def _refuse_degenerate(fit: Fit, rigid: bool) -> None:
+    """Raises ConfigError where the corners hardly determine the focal length."""
+    sigma = fit.sigmas()
+    focal = max(sigma[name] / value for name, value in parameters(fit).items() if name.split(".")[-1] in ("fx", "fy"))
+    tilt = tilts(fit)
+    advice = "tilt it by up to 45 deg to all sides, or give --distances"
+    if rigid:
+        advice = "the distances must differ and be those of the images in order"
+    elif max(tilt) < _MIN_TILT or _spread(fit) < _MIN_TILT:
+        raise ConfigError(
+            f"degenerate: the board faces the camera in every image (at most {math.degrees(max(tilt)):.0f} deg of tilt), "
+            f"so that its distance and the focal length cannot be told apart: {advice}"
+        )
+    if not focal < _MAX_FOCAL_SIGMA:
+        raise ConfigError(f"degenerate: the focal length is known to {100 * focal:.0f} % only: {advice}")
+
+
+def tilts(fit: Fit) -> list[float]:
+    """Angle of each body's normal against the left camera's axis [rad]."""
+    return [math.acos(float(np.clip(abs(X[2, 2]), 0, 1))) for X in fit.poses]
+
+
+def _spread(fit: Fit) -> float:
+    """Largest angle between the normals of two boards [rad]."""
+    normals = np.array([X[:, 2] for X in fit.poses])
+    return math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
+
+
+def _information(fit: Fit) -> float:
+    """Akaike's criterion: smaller explains the corners better for the number of parameters."""
+    n = 2 * sum(len(r) for view in fit.residuals for r in view)
+    return n * math.log(max(fit.rms, 1e-9) ** 2) + 2 * len(fit.names)
+
+
+def parameters(fit: Fit) -> dict[str, float]:
+    """Value of each lens parameter, named as in `Fit.names`."""
+    out = {}
+    for side, lens in zip(("left.", "right.") if len(fit.lenses) == 2 else ("",), fit.lenses):
+        if isinstance(lens, Lens):
+            values = {name: getattr(lens, name) for name in _PaperKind.names}
+        else:
+            K = lens.K
+            values = dict(zip(("fx", "fy", "cx", "cy"), (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+            values |= {name: value for name, value in zip(("k1", "k2", "p1", "p2", "k3"), lens.dist)}
+        out |= {side + name: float(value) for name, value in values.items()}
+    return out
+
+
+# ---------------------------------------------------------------- what matters: triangulated points
+
+
+def _sights(fit: Fit, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Raw px in both cameras of nine points at `distance`, 0.1 of it apart, about the middle of what both look at.
+
+    Points that a camera does not see are left out.
+    """
+    R, p = fit.X_LR[:, :3], fit.X_LR[:, 3]
+    ahead = (np.array([0, 0, 1]) + R[:, 2]) / np.linalg.norm(np.array([0, 0, 1]) + R[:, 2])
+    side, up = np.meshgrid([-0.1, 0, 0.1], [-0.1, 0, 0.1])
+    P = p / 2 + distance * (ahead + np.stack([side, up, 0 * up], -1).reshape(-1, 3))
+    seen, px = np.ones(len(P), bool), []
+    for lens, Q in zip(fit.lenses, (P, (P - p) @ R)):
+        xy = Q[:, :2] / Q[:, 2:]
+        px.append(lens.project(xy))
+        seen &= (Q[:, 2] > 0) & ((px[-1] >= 0) & (px[-1] <= [lens.width - 1, lens.height - 1])).all(1)
+        # Beyond its corners a lens model may fold back into the image.
+        seen &= np.linalg.norm(lens.normalize(px[-1]) - xy, axis=1) < 1e-3
+    return px[0][seen], px[1][seen]
+
+
+def triangulate_all(head: StereoHead, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Points (n, 3) in L nearest to the rays of raw px (n, 2), (n, 2): mid-points of the common perpendiculars."""
+    a = np.column_stack([head.left.normalize(left), np.ones(len(left))])
+    b = np.column_stack([head.right.normalize(right), np.ones(len(right))]) @ head.X_LR[:, :3].T
+    p = head.X_LR[:, 3]
+    aa, ab, bb, ap, bp = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1), a @ p, b @ p
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s, t = np.stack([bb * ap - ab * bp, ab * ap - aa * bp]) / (aa * bb - ab * ab)
+    return (s[:, None] * a + p + t[:, None] * b) / 2
+
+
+def _split_half(
+    fit: Fit, views: Sequence[View], kind: Any, size: tuple[int, int], least: int
+) -> dict[float, float] | None:
+    """Rms difference of the distances triangulated by the calibrations from the odd and from the even views [m].
+
+    Distances from the left camera, since a turn of both cameras together is no error of theirs.
+    """
+    heads = []
+    for first in (0, 1):
+        half = views[first::2]
+        if len(half) < least:
+            return None
+        bodies = sorted({view.body for view in half})
+        half = [dc.replace(view, body=bodies.index(view.body)) for view in half]
+        state = _State(tuple(kind_parameters(fit)), fit.X_LR, tuple(fit.poses[b] for b in bodies))
+        heads.append(_solve(half, kind, fit.kind, state, size).head())
+    out = {}
+    for distance in RANGES:
+        px = _sights(fit, distance)
+        if len(px[0]):
+            far = [np.linalg.norm(triangulate_all(head, *px), axis=1) for head in heads]
+            out[distance] = float(np.sqrt(((far[0] - far[1]) ** 2).mean()))
+    return out
+
+
+def kind_parameters(fit: Fit) -> list[np.ndarray]:
+    """Parameter vectors of the fit's lenses, in the order of `Fit.names`."""
+    values = parameters(fit)
+    names = [name for name in fit.names if not name.startswith("X_LR")]
+    return list(np.array([values[name] for name in names]).reshape(len(fit.lenses), -1))
+
+
+def _depth_sigma(fit: Fit, kind: Any, size: tuple[int, int]) -> dict[float, float]:
+    """Standard deviation of the depth of a point in the middle of the common view, by the covariance [m]."""
+    problem = _Problem([View(("", ""), np.zeros((0, 3)), (np.zeros((0, 2)),) * 2, 0)], kind, size)
+    state = _State(tuple(kind_parameters(fit)), fit.X_LR, (np.eye(3, 4),))
+    sigma = np.sqrt(np.diag(fit.covariance))
+    out = {}
+    for distance in RANGES:
+        px = _sights(fit, distance)
+        if not len(px[0]):
+            continue
+        middle = [one[[len(one) // 2]] for one in px]
+        J = []
+        for k, s in enumerate(sigma):
+            depth = []
+            for sign in (-1e-3, 1e-3):
+                step = np.zeros(problem.shared + 6)
+                step[k] = sign * s
+                there = problem.moved(state, step)
+                head = StereoHead(*(kind.lens(p, size) for p in there.lenses), there.X_LR)
+                depth.append(triangulate_all(head, *middle)[0, 2])
+            J.append((depth[1] - depth[0]) / (2e-3 * s) if s > 0 else 0.0)
+        out[distance] = float(np.sqrt(np.array(J) @ fit.covariance @ np.array(J)))
+    return out
+
+
+def _pitch(fit: Fit, views: Sequence[View], board: Board) -> tuple[float, float]:
+    """Triangulated distances of neighbouring corners along x over the true pitch: mean and standard deviation."""
+    head, ratios = fit.head(), []
+    for view in views:
+        grid = triangulate_all(head, *view.px).reshape(board.rows, board.columns, 3)
+        ratios.append(np.linalg.norm(np.diff(grid, axis=1), axis=2).ravel() / board.pitch_x)
+    return float(np.mean(ratios)), float(np.std(ratios))
+
+
+# ---------------------------------------------------------------- hand-eye
+
+
+@dc.dataclass(frozen=True)
+class HandEye:
+    """The camera in what carries it: X_EC on a hand (the board stands), X_BC beside the robot (the hand holds it)."""
+
+    X: np.ndarray  # (3, 4) X_EC, or X_BC
+    X_target: np.ndarray  # (3, 4) the board: X_BT, or X_ET
+    sigma_deg: np.ndarray  # (3,) jackknife, about the camera's axes
+    sigma_mm: np.ndarray  # (3,)
+    rotation_deg: np.ndarray  # (n,) residual of each view: the board's pose against X_target
+    position_mm: np.ndarray  # (n,)
+    left_out_deg: np.ndarray  # (n,) the same for a fit without that view
+    left_out_mm: np.ndarray
+    view_rms: np.ndarray  # (n,) of the corners [px]
+    rms: float  # [px]
+
+
+def board_pose(lens: LensModel, points: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """X_CT (3, 4) of a planar board by its corners' least squares."""
+    xy = lens.normalize(px)
+    _, rvec, tvec = cv2.solvePnP(points, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    rvec, tvec = cv2.solvePnPRefineLM(points, xy, np.eye(3), None, rvec, tvec)
+    return _transform(rvec, tvec)
+
+
+def closed_hand_eye(X_BE: Sequence[np.ndarray], X_CT: Sequence[np.ndarray]) -> np.ndarray:
+    """X_EC (3, 4) from hand poses and board poses (3, 4) each, by Park's method.
+
+    Raises ConfigError unless the hand turned about two axes: about one alone, the camera's place along it is free.
+    """
+    if len(X_BE) < 3:
+        raise ConfigError(f"hand-eye: {len(X_BE)} usable pose(s), needs at least 3")
+    turns = [frames.rotation_vector(a[:, :3].T @ b[:, :3]) for k, a in enumerate(X_BE) for b in X_BE[k + 1 :]]
+    second = float(np.linalg.svd(np.array(turns))[1][1] / math.sqrt(len(turns)))
+    if second < math.radians(2):
+        raise ConfigError(
+            f"hand-eye: the hand turned about one axis only ({math.degrees(second):.1f} deg about any other): "
+            "turn it about two axes, by 30 deg or more"
+        )
+    R, t = cv2.calibrateHandEye(
+        [X[:, :3] for X in X_BE],
+        [X[:, 3] for X in X_BE],
+        [X[:, :3] for X in X_CT],
+        [X[:, 3] for X in X_CT],
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )
+    if not (np.isfinite(R).all() and np.isfinite(t).all()):
+        raise ConfigError("hand-eye: no solution; do the poses belong to the images?")
+    return frames.make(R, t.ravel())
+
+
+def hand_eye(
+    lens: LensModel, points: np.ndarray, corners: Sequence[np.ndarray], X_BE: Sequence[np.ndarray], to_hand: bool = False
+) -> HandEye:
+    """Hand-eye calibration: Park's method, then least squares of all corners' residuals.
+
+    points (n, 3) in T, corners [(n, 2)] raw px, X_BE (3, 4) for each. to_hand: the camera stands beside the robot and
+    the hand holds the board; the answer is then X_BC.
+    """
+    # Beside the robot, base and hand change places.
+    X_BE = [frames.inverse(X) if to_hand else np.asarray(X, float) for X in X_BE]
+    X_CT = [board_pose(lens, points, px) for px in corners]
+    xy = [lens.normalize(px) for px in corners]
+    X, X_target = _refined_hand_eye(lens, points, xy, X_BE, X_CT)
+    rotation, position = _board_residuals(X, X_target, X_BE, X_CT)
+    everything = range(len(X_BE))
+    turned, moved, left_out = [], [], []
+    for k in everything if len(X_BE) > 3 else ():
+        rest = [i for i in everything if i != k]
+        try:
+            one = _refined_hand_eye(lens, points, [xy[i] for i in rest], [X_BE[i] for i in rest], [X_CT[i] for i in rest])
+        except ConfigError:  # the view that alone brought a second axis
+            left_out.append((math.nan, math.nan))
+            continue
+        turned.append(frames.rotation_vector(X[:, :3].T @ one[0][:, :3]))
+        moved.append(one[0][:, 3])
+        left_out.append([float(v[0]) for v in _board_residuals(*one, [X_BE[k]], [X_CT[k]])])
+    n = len(turned)
+    spread = [np.full(3, math.nan)] * 2
+    if n > 1:
+        spread = [np.sqrt((n - 1) / n * ((v - np.mean(v, 0)) ** 2).sum(0)) for v in (np.array(turned), np.array(moved))]
+    square = []
+    for X_i, seen in zip(X_BE, xy):
+        P = frames.apply(frames.compose(frames.inverse(X), frames.inverse(X_i), X_target), points)
+        square.append((((P[:, :2] / P[:, 2:] - seen) * lens.focal()) ** 2).sum(1))
+    out = np.array(left_out or [(math.nan, math.nan)] * len(X_BE))
+    return HandEye(
+        X=X,
+        X_target=X_target,
+        sigma_deg=np.degrees(spread[0]),
+        sigma_mm=1e3 * spread[1],
+        rotation_deg=rotation,
+        position_mm=position,
+        left_out_deg=out[:, 0],
+        left_out_mm=out[:, 1],
+        view_rms=np.array([math.sqrt(s.mean()) for s in square]),
+        rms=math.sqrt(np.mean(square)),
+    )
+
+
+def _board_residuals(
+    X: np.ndarray, X_target: np.ndarray, X_BE: Sequence[np.ndarray], X_CT: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far each view puts the board from where it is [deg], [mm]."""
+    boards = [frames.compose(X_i, X, X_j) for X_i, X_j in zip(X_BE, X_CT)]
+    turn = [np.degrees(np.linalg.norm(frames.rotation_vector(X_target[:, :3].T @ B[:, :3]))) for B in boards]
+    return np.array(turn), np.array([1e3 * np.linalg.norm(B[:, 3] - X_target[:, 3]) for B in boards])
+
+
+def _refined_hand_eye(
+    lens: LensModel,
+    points: np.ndarray,
+    xy: Sequence[np.ndarray],
+    X_BE: Sequence[np.ndarray],
+    X_CT: Sequence[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """X_EC and X_BT from all corners together, started by the closed form."""
+    X = closed_hand_eye(X_BE, X_CT)
+    boards = [frames.compose(X_i, X, X_j) for X_i, X_j in zip(X_BE, X_CT)]
+    R0 = boards[0][:, :3]
+    turn = np.mean([frames.rotation_vector(R0.T @ B[:, :3]) for B in boards], axis=0)
+    X_BT = frames.make(R0 @ frames.rotation(turn), np.mean([B[:, 3] for B in boards], axis=0))
+    S, focal, ones = _skew(points), lens.focal(), np.broadcast_to(np.eye(2), (len(points), 2, 2))
+
+    def problem(state: tuple[np.ndarray, np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
+        X_EC, X_BT = state
+        H, g, cost = np.zeros((12, 12)), np.zeros(12), 0.0
+        for X_i, seen in zip(X_BE, xy):
+            R = (X_i[:, :3] @ X_EC[:, :3]).T  # R_CB
+            P = frames.apply(frames.compose(frames.inverse(X_EC), frames.inverse(X_i), X_BT), points)
+            if not (P[:, 2] > 1e-6).all():
+                return math.inf, H, g
+            at = P[:, :2] / P[:, 2:]
+            D = focal * np.concatenate([ones, -at[:, :, None]], 2) / P[:, 2, None, None]
+            dP = np.concatenate(
+                [
+                    _skew(P),
+                    np.broadcast_to(-X_EC[:, :3].T, S.shape),
+                    -R @ X_BT[:, :3] @ S,
+                    np.broadcast_to(R, S.shape),
+                ],
+                2,
+            )
+            J, r = (D @ dP).reshape(-1, 12), focal * (at - seen).ravel()
+            H, g, cost = H + J.T @ J, g + J.T @ r, cost + float(r @ r)
+        return cost, H, g
+
+    def moved(state: tuple[np.ndarray, np.ndarray], step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _moved(state[0], step[:6]), _moved(state[1], step[6:])
+
+    return _minimize(problem, (X, X_BT), moved)[0]
+
+
+# ---------------------------------------------------------------- small helpers
+
+
+def _moved(X: np.ndarray, step: np.ndarray) -> np.ndarray:
+    return frames.make(X[:, :3] @ frames.rotation(step[:3]), X[:, 3] + step[3:])
+
+
+def _skew(v: np.ndarray) -> np.ndarray:
+    """[v]x of (n, 3) -> (n, 3, 3)."""
+    S = np.zeros((len(v), 3, 3))
+    S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    return S - S.transpose(0, 2, 1)
+
+
+def _transform(rvec: np.ndarray, tvec: np.ndarray) -> np.ndarray:
+    return frames.make(cv2.Rodrigues(rvec)[0], tvec.ravel())
+
+
+def _rms(residuals: np.ndarray) -> float:
+    return float(np.sqrt((residuals * residuals).sum(1).mean()))

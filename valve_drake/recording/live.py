@@ -1,0 +1,104 @@
+"""The log's channels served live to Foxglove over its WebSocket: a sink for the recorder, beside the log's writer.
+
+Only what somebody looks at is encoded and sent. A new subscriber gets the topic's last message at once, so that the scene
+and the calibrations, which are rare, are there wherever one tunes in. The server never holds up the loop: a client that
+is too slow loses messages.
+"""
+
+from types import TracebackType
+from typing import Any, Self
+
+from google.protobuf.message import Message as Proto
+
+from valve_drake.checks import ConfigError
+from valve_drake.messages import Message
+from valve_drake.recording import schemas
+from valve_drake.recording.foxglove import NANO, nanoseconds
+
+HOST, PORT = "127.0.0.1", 8765
+CLOCK_PERIOD = NANO // 32  # between two words on the time to the clients [ns]
+
+
+class LiveView:
+    """A sink of the recorder (recorder_system.Sink). Use it as a context manager: leaving it ends the server.
+
+    port 0: any free one; `port` says which. Raises ConfigError if the `live` extra is missing or the port is taken.
+    """
+
+    def __init__(self, port: int = PORT, host: str = HOST):
+        try:
+            import foxglove
+            from foxglove.websocket import ServerListener
+        except ImportError:
+            raise ConfigError("--live needs the foxglove-sdk package: pip install 'valve-drake[live]'") from None
+
+        class Listener(ServerListener):
+            def on_subscribe(_, client: Any, channel: Any) -> None:
+                self._repeat(channel.topic)
+
+        self._foxglove = foxglove
+        self._context = foxglove.Context()
+        self._channels: dict[str, Any] = {}
+        self._last: dict[str, tuple[Message | bytes, int]] = {}  # topic -> message, when [ns]
+        self._clock = -CLOCK_PERIOD
+        try:
+            self._server = foxglove.start_server(
+                name="valve-drake",
+                host=host,
+                port=port,
+                capabilities=[foxglove.Capability.Time],
+                server_listener=Listener(),
+                context=self._context,
+            )
+        except (RuntimeError, OSError) as error:
+            raise ConfigError(f"--live cannot serve on {host}:{port}: {error}") from None
+
+    @property
+    def port(self) -> int:
+        return self._server.port
+
+    def write(self, topic: str, message: Message | Proto, time: float) -> None:
+        """Sends a message of `topic` at `time` [s] to those who have subscribed to it."""
+        when = nanoseconds(time)
+        if when - self._clock >= CLOCK_PERIOD:
+            self._clock = when
+            self._server.broadcast_time(when)
+        channel = self._channels.get(topic) or self._define(topic, type(message))
+        # A Message never changes; a protobuf message is filled again by its maker.
+        kept = message if isinstance(message, Message) else message.SerializeToString()
+        self._last[topic] = kept, when
+        if channel.has_sinks():
+            channel.log(_encoded(kept), log_time=when)
+
+    def flush(self) -> None:
+        """Nothing is kept back."""
+
+    def close(self) -> None:
+        self._server.stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _define(self, topic: str, kind: type) -> Any:
+        proto = schemas.proto_class(kind) if issubclass(kind, Message) else kind
+        schema = self._foxglove.Schema(
+            name=proto.DESCRIPTOR.full_name, encoding="protobuf", data=schemas.schema_data(proto)
+        )
+        channel = self._foxglove.Channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
+        self._channels[topic] = channel
+        return channel
+
+    def _repeat(self, topic: str) -> None:
+        """Called by the server's thread."""
+        if topic in self._last and topic in self._channels:
+            kept, when = self._last[topic]
+            self._channels[topic].log(_encoded(kept), log_time=when)
+
+
+def _encoded(kept: Message | bytes) -> bytes:
+    return kept if isinstance(kept, bytes) else schemas.encode(kept)

@@ -1,0 +1,192 @@
+"""The recorded station: the contract's ports, fed by a log instead of a machine. No physics, no rendering.
+
+It shows every reader what that reader was shown when the log was written, to the bit. The recorder publishes at every
+tick and sees what was there before the tick's updates; a stage reads in the slot that it runs in (ports.py). Hence
+
+| what               | is recorded at                                   | and is shown again               |
+|--------------------|--------------------------------------------------|----------------------------------|
+| all vectors        | every tick, which is when robot_state reads them | from that tick on                |
+| health             | the tick after it appeared                       | from right after the tick before |
+| images             | the tick after a stage has looked at one         | from right after the tick before |
+| operator's command | the tick after it was given                      | given right after the tick before |
+
+An image is the recorded JPEG, decoded as the live camera does, with the capture time and the sequence that its consumer
+passed on. Images that no stage looked at are not in a log: who looks at another time sees the last recorded one.
+"""
+
+import bisect
+import collections
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+
+from valve_drake.checks import ConfigError
+from valve_drake.messages import SIDES, CameraFrame
+from valve_drake.ports import TICK
+from valve_drake.recording.foxglove import NANO, nanoseconds
+from valve_drake.recording.reader import LogReader
+from valve_drake.recording.signals import FRAMES, MEASURED, topic_of
+from valve_drake.stations.camera_rig import decode_image
+from valve_drake.stations.contract import CAMERAS, CONTRACT, check_contract
+
+JOINTS, HEALTH, OPERATOR = "/joint_states", "/health", "/operator/command"
+WRENCHES = {f"/{side}_wrist/wrench": f"{side}_wrist.wrench" for side in SIDES}
+CONSUMERS = {topic_of(port) for port, _, _ in FRAMES.values()}
+IMAGES = {f"/{camera}/image": camera for camera in CAMERAS}
+
+
+class Track:
+    """What one port showed: values by the time of the tick that recorded them."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []  # [s]
+        self.values: list[Any] = []
+
+    def add(self, time: float, value: Any) -> None:
+        self.times.append(time)
+        self.values.append(value)
+
+    def at(self, time: float) -> Any:
+        """The last value recorded up to `time`; the first one before that."""
+        return self.values[max(bisect.bisect_right(self.times, time) - 1, 0)]
+
+
+class Recording:
+    """All that a log holds of the machine that it was recorded from.
+
+    end: the last tick up to which everything is there [s]; a damaged log is replayed up to its damage.
+    tracks: Track by port of the contract: arrays, Health, or (time, CameraFrame without its image).
+    requests: the operator's commands.
+    Raises ConfigError if the log lacks something that the stages read.
+    """
+
+    def __init__(self, log: LogReader):
+        self._log = log
+        self.tracks: dict[str, Track] = collections.defaultdict(Track)
+        self.requests = Track()
+        needed = {JOINTS, HEALTH, OPERATOR, *WRENCHES, *CONSUMERS}
+        if missing := sorted(needed - {name for name, topic in log.topics.items() if topic.count > 0}):
+            raise ConfigError(f"{log.path} cannot be replayed: it has no messages of {', '.join(missing)}")
+        images = set()  # topic, time
+        for record in log.records(needed | (IMAGES.keys() & log.topics)):
+            topic, time = record.topic, record.time
+            if topic in IMAGES:
+                images.add((topic, time))
+                continue
+            message = log.decode(record)
+            if topic == JOINTS:
+                self._add_joints(time, message)
+            elif topic in WRENCHES:
+                self.tracks[WRENCHES[topic]].add(time, np.concatenate([message.torque, message.force]))
+            elif topic in CONSUMERS:
+                self._add_frames(topic, time, message)
+            else:
+                (self.requests if topic == OPERATOR else self.tracks["health"]).add(time, message)
+        self.end = self._sound_end()
+        for camera in CAMERAS:
+            track = self.tracks[f"{camera}.image"]
+            for time, frame in track.values:
+                if frame.sequence >= 0 and time <= self.end and (f"/{camera}/image", time) not in images:
+                    raise ConfigError(f"{log.path} lacks the image {frame.sequence} of {camera} at t = {time:.3f} s")
+
+    def frame(self, time: float, header: CameraFrame) -> CameraFrame:
+        """The frame with its image, as recorded at `time`."""
+        if header.sequence < 0:
+            return header
+        for _, _, message in self._log.messages([f"/{header.camera}/image"], time, time):
+            stamp = message.timestamp
+            if stamp.seconds * NANO + stamp.nanos == nanoseconds(header.time):
+                data = message.data
+                return CameraFrame(header.camera, header.time, header.sequence, decode_image(data), data)
+        raise ConfigError(f"{self._log.path} holds another image of {header.camera} at t = {time:.3f} s")
+
+    def _add_joints(self, time: float, states: JointStates) -> None:
+        joints = {joint.name: joint for joint in states.joints}
+        for port, names in MEASURED.items():
+            values = []
+            for name in names:
+                joint, quantity = name.split(".")
+                if joint not in joints or not joints[joint].HasField(quantity):
+                    raise ConfigError(f"{self._log.path}: {JOINTS} has no {name}")
+                values.append(getattr(joints[joint], quantity))
+            self.tracks[port].add(time, np.array(values))
+
+    def _add_frames(self, topic: str, time: float, message: Any) -> None:
+        for camera, (port, _, frame) in FRAMES.items():
+            if topic_of(port) != topic:
+                continue
+            header, track = frame(message), self.tracks[f"{camera}.image"]
+            if not track.values:
+                track.add(0.0, (0.0, CameraFrame(camera=camera)))  # before the first capture
+            if header.sequence != track.values[-1][1].sequence:
+                track.add(time, (time, header))
+
+    def _sound_end(self) -> float:
+        """Every tick is in JOINTS: the first one that is missing tells where something was lost."""
+        times = self.tracks["base.odometry"].times
+        count = next((k for k, time in enumerate(times) if time != k * TICK), len(times))
+        damaged = self._log.damage or self._log.metadata.get("recovered", {}).get("damage")
+        last = count - 1 - bool(damaged or count < len(times))  # of the last tick before a loss some may be missing
+        if last < 0:
+            raise ConfigError(f"{self._log.path} has no tick that is whole")
+        return last * TICK
+
+
+class RecordedStation(LeafSystem):
+    """A Recording on the contract's ports. Its outputs are functions of time; its inputs are not read."""
+
+    def __init__(self, recording: Recording):
+        super().__init__()
+        self.set_name("recorded_station")
+        self._frame = functools.lru_cache(maxsize=len(CAMERAS))(recording.frame)
+        for spec in CONTRACT:
+            if spec.direction == "in":
+                self.DeclareVectorInputPort(spec.name, spec.kind)
+                continue
+            track = recording.tracks[spec.name]
+            when = {self.time_ticket()}
+            if isinstance(spec.kind, int):
+                self.DeclareVectorOutputPort(spec.name, spec.kind, _vector(track), when)
+            else:
+                calc = self._image(track) if spec.kind is CameraFrame else _message(track)
+                self.DeclareAbstractOutputPort(spec.name, functools.partial(Value, spec.kind()), calc, when)
+
+    def _image(self, track: Track) -> Callable[[Context, Value], None]:
+        def calc(context: Context, output: Value) -> None:
+            output.set_value(self._frame(*track.at(_next_tick(context.get_time()))))
+
+        return calc
+
+
+def _vector(track: Track) -> Callable[[Context, BasicVector], None]:
+    return lambda context, output: output.SetFromVector(track.at(context.get_time()))
+
+
+def _message(track: Track) -> Callable[[Context, Value], None]:
+    return lambda context, output: output.set_value(track.at(_next_tick(context.get_time())))
+
+
+def _next_tick(time: float) -> float:
+    """The tick at or after `time`: the one that recorded what could be read then."""
+    return math.ceil(time / TICK) * TICK
+
+
+def make_replay_station(recording: Recording) -> Diagram:
+    """The station as a Diagram named `replay`."""
+    builder = DiagramBuilder()
+    station = builder.AddSystem(RecordedStation(recording))
+    for spec in CONTRACT:
+        if spec.direction == "in":
+            builder.ExportInput(station.GetInputPort(spec.name), spec.name)
+        else:
+            builder.ExportOutput(station.GetOutputPort(spec.name), spec.name)
+    diagram = builder.Build()
+    diagram.set_name("replay")
+    check_contract(diagram)
+    return diagram
