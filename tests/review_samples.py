@@ -1,7 +1,7 @@
 """A made-up run of six seconds with known truth, for the tests of metrics, page and comparison: no simulation.
 
-The marker's estimate is off by ERROR_P in the left camera and ERROR_W about the marker's axes, the joints lag by LAG, the
-valve turns by ANGLE between 3.5 s and 4.5 s, and servo is entered twice.
+The marker's estimate is off by ERROR_P in the left camera and ERROR_W about the marker's axes, the joints lag by LAG,
+the valve turns by ANGLE between 3.5 s and 4.5 s, and servo is entered twice.
 """
 
 import cv2
@@ -88,7 +88,14 @@ def estimate(t, sequence):
     X = make(true[:, :3] @ rotation(ERROR_W), true[:, 3] + ERROR_P)
     X_OL = compose(planar(*base(t)), GEOMETRY.X_BL(torso(t)))
     return RectangleEstimate(
-        time=t, sequence=sequence, found=True, cameras=2, X_LV=X, covariance=np.diag(SIGMA**2), residual_px=0.1, X_OL=X_OL
+        time=t,
+        sequence=sequence,
+        found=True,
+        cameras=2,
+        X_LV=X,
+        covariance=np.diag(SIGMA**2),
+        residual_px=0.1,
+        X_OL=X_OL,
     )
 
 
@@ -130,17 +137,20 @@ def every_tick(t, k):
     yield "/image_servo/servo", ServoState(time=t, left_error=left, right_error=1.5 * left)
     if 3.0 <= t < 5.0:
         turning = mode == "turn"
-        yield "/hybrid_rotation/turn", TurnState(
-            time=t,
-            stage=mode,
-            angle=valve_angle(t),
-            angle_reference=valve_angle(t),
-            torque=TORQUE * turning,
-            squeeze=-1.0,
-            force_left=np.array([0.0, FORCE * turning, 0.0]),
-            force_right=np.array([0.0, 0.0, FORCE * turning / 2]),
-            moment_left=np.array([0.3, 0.0, 0.0]),
-            stem_force=np.array([STEM, 0.0, 0.0]),
+        yield (
+            "/hybrid_rotation/turn",
+            TurnState(
+                time=t,
+                stage=mode,
+                angle=valve_angle(t),
+                angle_reference=valve_angle(t),
+                torque=TORQUE * turning,
+                squeeze=-1.0,
+                force_left=np.array([0.0, FORCE * turning, 0.0]),
+                force_right=np.array([0.0, 0.0, FORCE * turning / 2]),
+                moment_left=np.array([0.3, 0.0, 0.0]),
+                stem_force=np.array([STEM, 0.0, 0.0]),
+            ),
         )
 
 
@@ -153,7 +163,10 @@ def every_fourth(t):
         yield "/events", foxglove.mode_event(state)
         yield "/log", foxglove.mode_log(state)
     ages = np.array([0.02, 0.3 if 2.0 <= t < 2.1 else 0.01])
-    yield "/health", Health(time=t, devices=("base", "head_left"), ages=ages, faults=("base: late",) if t == 4.0 else ())
+    yield (
+        "/health",
+        Health(time=t, devices=("base", "head_left"), ages=ages, faults=("base: late",) if t == 4.0 else ()),
+    )
     before = max(t - TICK, 0.0)  # the truth block holds its outputs for a tick, and has none at 0
     values = {
         "truth.valve_angle": [0.3 + valve_angle(before), 0.0],
@@ -177,7 +190,9 @@ def messages(end=END):
             found += camera_images(capture, k // 16)
             found.append(("/rectangle_estimator/estimate", estimate(capture, k // 16)))
             p = X_LV(capture)[:, 3] * 1.01
-            found.append(("/stereo_positioning/position", StereoPosition(time=capture, sequence=k // 16, found=True, p_LV=p)))
+            found.append(
+                ("/stereo_positioning/position", StereoPosition(time=capture, sequence=k // 16, found=True, p_LV=p))
+            )
         if t == 5.25:
             done = Status(time=t, activation=9, state="succeeded", progress=1.0, value=ANGLE + 0.001)
             found.append(("/kinematic_approach/status", done))
@@ -186,7 +201,10 @@ def messages(end=END):
 
 
 def write_run(path, *, end=END, without=(), change=None, scenario=SCENARIO, finished=True):
-    """Writes the run. without: topics to leave out. change: (topic, message, time) -> another message, or None to drop it."""
+    """Writes the run.
+
+    without: topics to leave out. change: (topic, message, time) -> another message, or None to drop it.
+    """
     with LogWriter(path) as writer:
         writer.write_metadata("run", {"seed": "7", "station": "simulated", "commit": "f" * 40, "scenario": scenario})
         for topic, message, t in messages(end):

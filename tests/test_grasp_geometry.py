@@ -1,4 +1,4 @@
-"""grasp_geometry: grasps fixed to the valve, the sign of the turn, and stances that serve over the whole range of valves."""
+"""grasp_geometry: grasps fixed to the valve, the sign of the turn, and stances that serve the whole range of valves."""
 
 import dataclasses as dc
 
@@ -83,7 +83,9 @@ def test_hands_hold_the_marked_ends_of_the_bar(swapped):
         assert abs(X_VG[1, 1]) == 1  # closes across the bar
         assert np.linalg.det(X_VG[:, :3]) == pytest.approx(1)
         left = hand_in_valve("left", swapped, MARKER)
-        assert X_VG[:, 0] == pytest.approx(left[:, 3] / np.linalg.norm(left[:2, 3]) * [1, 1, 0])  # to the left hand's end
+        assert X_VG[:, 0] == pytest.approx(
+            left[:, 3] / np.linalg.norm(left[:2, 3]) * [1, 1, 0]
+        )  # to the left hand's end
 
 
 def test_hand_poses_are_constant_in_the_valve_while_it_turns():
@@ -179,7 +181,9 @@ def test_handles_are_shared_the_better_way():
     assert crossed.margin < straight.margin
 
 
-@pytest.mark.parametrize("changes", [{"distance_min": 0.3}, {"distance_min": 0.9}, {"arc_step": 0.0}, {"standoff": float("nan")}])
+@pytest.mark.parametrize(
+    "changes", [{"distance_min": 0.3}, {"distance_min": 0.9}, {"arc_step": 0.0}, {"standoff": float("nan")}]
+)
 def test_bad_config_is_refused_by_name(changes):
     with pytest.raises(ConfigError, match=f"stance.{next(iter(changes))}"):
         StanceConfig(**changes).check()

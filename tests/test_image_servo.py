@@ -1,4 +1,4 @@
-"""image_servo: both hands find their handles by uncalibrated cameras, keep to their limits, and say so when they cannot."""
+"""image_servo: both hands find their handles by uncalibrated cameras, keep to their limits, say when they cannot."""
 
 import dataclasses as dc
 
@@ -71,7 +71,7 @@ class Camera:
 
 
 class Bench:
-    """Both hands and their cameras. Arms follow commands two ticks late; an image is used one image after it was taken."""
+    """Both hands and their cameras. Arms follow commands two ticks late; an image comes out one image late."""
 
     def __init__(self, seed: int, reach: float = 0.06, config: ImageServoConfig = CONFIG):
         rng = np.random.default_rng(seed)
@@ -116,8 +116,8 @@ class Bench:
         self.memory, command, self.servo = self.law.step(self.time, DT, self.memory, state, mode, marks)
         self.commands.append(command)
         if command.left_arm is not None:
-            reached = {"left": command.left_arm + [self.sag, 0, 0, 0, 0, 0], "right": command.right_arm + [self.sag, 0, 0, 0, 0, 0]}
-            self.queue = [*self.queue[1:], reached]
+            sag = np.array([self.sag, 0, 0, 0, 0, 0])
+            self.queue = [*self.queue[1:], {"left": command.left_arm + sag, "right": command.right_arm + sag}]
         self.time += DT
         self.tick += 1
         return self.memory.status
@@ -234,8 +234,8 @@ def test_a_hand_that_is_held_fast_is_not_pressed_on_for_ever():
 
 @pytest.mark.parametrize("side", SIDES)
 def test_a_lost_mark_stops_the_hand_and_ends_with_the_verdict(side):
-    bench = Bench(8)
-    for _ in range(24):
+    bench = Bench(8, reach=0.15)
+    for _ in range(12):
         bench.step()
     bench.hidden = {side}
     lost = bench.time
@@ -243,8 +243,9 @@ def test_a_lost_mark_stops_the_hand_and_ends_with_the_verdict(side):
     assert (status.state, status.verdict) == ("failed", "marker_lost")
     assert side in status.detail
     assert 1.0 < bench.time - lost < 1.0 + 3 * IMAGE * DT
-    blind = [getattr(c, f"{side}_arm") for c in bench.commands[-int(0.6 / DT) :]]
-    assert np.ptp(blind, axis=0).max() < 1e-9  # stood still long before that
+    q = np.array([getattr(c, f"{side}_arm") for c in bench.commands if c.time > lost])
+    moving = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-9)
+    assert 0.2 < moving[-1] * DT < 0.25 + 3 * IMAGE * DT  # the last image's goal lay further off: it stopped blind
 
 
 def test_a_mark_that_never_comes_is_lost_as_well():
@@ -306,7 +307,8 @@ def test_a_joint_at_its_limit_never_swings_round():
         t = 1.0 + k * DT
         mark = HandleMark(time=t, sequence=k, found=True, feature=taught.feature + taught.jacobian @ e)
         state = RobotState(time=t, left_arm=before, right_arm=arms["right"])
-        memory, command, _ = law.step(t, DT, memory, state, SERVO, HandleMarks(left=mark, right=dc.replace(mark, found=False)))
+        marks = HandleMarks(left=mark, right=dc.replace(mark, found=False))
+        memory, command, _ = law.step(t, DT, memory, state, SERVO, marks)
         assert np.abs(command.left_arm - before).max() < 0.1
         before = command.left_arm
     assert before[3] > 3.315  # it was pushed to the limit: the test is not idle
@@ -345,7 +347,8 @@ def test_bad_config_is_refused_by_name(changes):
 
 def rig(**inputs) -> Rig:
     bench = Bench(17)
-    seen = {side: HandleMark(time=0.0, sequence=0, found=True, feature=c.look(bench.X(side))[0]) for side, c in bench.cameras.items()}
+    features = {side: camera.look(bench.X(side))[0] for side, camera in bench.cameras.items()}
+    seen = {side: HandleMark(time=0.0, sequence=0, found=True, feature=s) for side, s in features.items()}
     state = RobotState(left_arm=bench.queue[0]["left"], right_arm=bench.queue[0]["right"])
     fixed = {"robot_state": state, "mode": SERVO, "marks": HandleMarks(**seen)}
     return Rig(ImageServoSystem(bench.law), **fixed | inputs)

@@ -103,7 +103,9 @@ def test_a_via_that_serves_is_taken_before_any_search():
     assert ball.asked < 100
 
 
-@pytest.mark.parametrize("start, goal", [((0,), (1,)), ((1,), (0,)), ((0.1, -0.3), (0.9, 0.4)), ((0.5, 0.5), (0.5, -0.5))])
+@pytest.mark.parametrize(
+    "start, goal", [((0,), (1,)), ((1,), (0,)), ((0.1, -0.3), (0.9, 0.4)), ((0.5, 0.5), (0.5, -0.5))]
+)
 def test_the_search_goes_round_an_obstacle(start, goal):
     ball = Ball()
     points = find_path(joints(*start), joints(*goal), [], ball)

@@ -1,4 +1,4 @@
-"""kinematic_approach: free, bounded motions of both arms; where to stand; what is measured at rest before and after the turn."""
+"""kinematic_approach: free, bounded motions of both arms; where to stand; the looks before and after the turn."""
 
 import dataclasses as dc
 
@@ -7,14 +7,21 @@ import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
 
 from valve_drake import resources
-from valve_drake.behaviors.grasp_geometry import StanceConfig, find_stance, hand_in_valve, standoff, turned
+from valve_drake.behaviors.grasp_geometry import (
+    StanceConfig,
+    find_stance,
+    hand_in_valve,
+    standoff,
+    turn_between,
+    turned,
+)
 from valve_drake.behaviors.kinematic_approach import CONTACT, KinematicApproach, KinematicApproachConfig, Memory
 from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, inverse, make, planar, rotation, rotation_vector
-from valve_drake.kinematics import ARM_LIMITS, GEOMETRY
+from valve_drake.kinematics import ARM_LIMITS, GEOMETRY, lateral
 from valve_drake.messages import (
     SIDES,
     Command,
@@ -140,7 +147,9 @@ def assert_smooth(commands: list[np.ndarray]) -> None:
 # ---------------------------------------------------------------- at home
 
 
-@pytest.mark.parametrize("mode", [Mode.IDLE, Mode.SEARCH, Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT, Mode.DONE])
+@pytest.mark.parametrize(
+    "mode", [Mode.IDLE, Mode.SEARCH, Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT, Mode.DONE]
+)
 def test_where_it_has_nothing_else_to_do_the_arms_go_home_and_stay(base, mode):
     bench = Bench(base, arms=HOME + np.tile([0.2, -0.1, 0.3, 0.4, -0.2, 0.1], 2))
     start = bench.arms
@@ -307,7 +316,8 @@ def test_reaching_ends_when_both_marks_are_large_enough(base):
         if b.time > begun + 0.5:
             big = 1.01 * CONFIG.mark_ratio**2
             b.marks = HandleMarks(
-                left=HandleMark(found=True, area=big * AREA["left"]), right=HandleMark(found=True, area=big * AREA["right"])
+                left=HandleMark(found=True, area=big * AREA["left"]),
+                right=HandleMark(found=True, area=big * AREA["right"]),
             )
 
     status = bench.run(Mode.REACH, each=near)
@@ -333,19 +343,20 @@ def test_a_blocked_standoff_fails_with_a_verdict_and_the_arms_stay(base):
     assert bench.arms == pytest.approx(HOME)
 
 
-def test_a_way_round_an_obstacle_stays_within_the_joint_limits(base):
+@pytest.mark.parametrize("detour", [0.55, 0.6, 0.65])
+def test_a_way_round_an_obstacle_stays_within_the_joint_limits(base, detour):
     """The shortest way round leads through angles that the elbow does not have."""
     goal = []
 
     def is_free(X_BV, q):
         share = (q[0] - HOME[0]) / (goal[0][0] - HOME[0]) if goal else 0.0
-        return not 0.35 < share < 0.65 or bool(q[2] < HOME[2] - 0.60)  # J3 is -1.9 at home; its limit is -2.62
+        return not 0.35 < share < 0.65 or bool(q[2] < HOME[2] - detour)  # J3 is -1.9 at home; its limit is -2.62
 
     bench = Bench(base, is_free).measured()
     goal.append(bench.law._standoff_joints(bench.memory.plan))
     status = bench.run(Mode.REACH, limit=20)
     assert status.state == "succeeded", status.detail
-    assert min(q[2] for q in bench.commands) < HOME[2] - 0.5  # it did go round
+    assert min(q[2] for q in bench.commands) <= HOME[2] - detour + 0.05  # it did go round
     assert np.all(np.abs(bench.commands) <= np.tile(ARM_LIMITS, 2))
 
 
@@ -401,6 +412,48 @@ def test_a_rectangle_that_looks_alike_after_part_of_a_turn_is_counted_by_the_han
         seen = bench.law.seen_angle(X_OV, turned(X_OV, true if known else 0.0), known, true + 0.1)
         assert seen == pytest.approx(true, abs=1e-9)
     assert bench.law.seen_angle(X_OV, turned(X_OV, 0.2 + np.pi), True, 0.1) == pytest.approx(0.2)
+
+
+def test_the_way_home_keeps_clear_of_the_valve_as_the_hands_left_it(base):
+    asked = []
+    bench, _ = verify(base, 0.6, 0.58, 0.6, is_free=lambda X_BV, q: not asked.append(X_BV))
+    assert turn_between(bench.memory.plan.X_BV, asked[-1]) == pytest.approx(0.58)
+    assert turn_between(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.0)  # on the way there
+
+
+def test_an_early_retreat_keeps_clear_of_the_valve_too(base):
+    asked = []
+    bench = Bench(base, lambda X_BV, q: not asked.append(X_BV)).at_standoff()
+    bench.turn = TurnState(angle=0.4)
+    asked.clear()
+    bench.run(Mode.RETREAT, limit=0.1)
+    assert turn_between(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.4)
+    bench = Bench(base, lambda X_BV, q: not asked.append(X_BV), arms=HOME + 0.1)
+    asked.clear()
+    bench.run(Mode.ROUGH_APPROACH, limit=0.1)
+    assert asked and all(X_BV is None for X_BV in asked)  # far from any valve
+
+
+@pytest.mark.parametrize("homewards", [True, False])
+def test_where_the_straight_line_is_blocked_the_hands_move_straight_back_from_the_valve(base, homewards):
+    """From the handles home, and to the stand-off: by way of a place further back, not by a search."""
+    bench = Bench(base).at_standoff()
+    at_valve, X_BV = bench.arms, bench.memory.plan.X_BV
+    start, goal = (at_valve, HOME) if homewards else (HOME, at_valve)
+    vias = bench.law._vias(start, goal, X_BV)
+    assert len(vias) == 3
+    for via, back in zip(vias, (0.10, 0.16, 0.22)):
+        for k, side in enumerate(SIDES):
+            X0, X1 = (GEOMETRY.arm_forward(q[6 * k : 6 * k + 6], side) for q in (at_valve, via))
+            moved = X1[:, 3] - X0[:, 3] + back * X0[:, 2]
+            assert moved == pytest.approx([0, lateral(side) * back / 2, 0])  # and a little outwards
+            assert X1[:, :3] == pytest.approx(X0[:, :3])
+    middle = (start + goal) / 2
+    bench.law.is_free = lambda X_BV, q: bool(np.abs(q - middle).max() > 0.08)
+    bench.run(Mode.IDLE, limit=0.1)
+    bench.memory = dc.replace(bench.memory, q=start, path=None)
+    bench.run(Mode.VERIFY if homewards else Mode.REACH)
+    assert np.abs(np.array(bench.commands) - vias[0]).max(axis=1).min() < 0.01  # it went through the first
 
 
 def test_no_way_home_fails_with_a_verdict(base):

@@ -5,7 +5,7 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from valve_drake.frames import compose, inverse, make, planar, rotation, rotation_vector
+from valve_drake.frames import apply, compose, inverse, make, planar, rotation, rotation_vector
 from valve_drake.kinematics import ARM_LIMITS, GEOMETRY, R_G0, lateral
 from valve_drake.messages import LEFT, SIDES
 from valve_drake.stations.scene import parse
@@ -38,9 +38,14 @@ class Model:
         X = self.plant.GetFrameByName(name).CalcPose(self.context, self.plant.GetFrameByName(base))
         return X.GetAsMatrix34()
 
-    def hand(self, side: str) -> list[int]:
-        bodies = [f"{side}_hand", f"{side}_finger_1_link", f"{side}_finger_2_link"]
-        return [self.plant.GetBodyByName(name).index() for name in bodies]
+    def hand(self, side: str) -> tuple[float, np.ndarray]:
+        """Mass of everything beyond the wrist sensor, and its centre of mass in the world."""
+        mass, moment = 0.0, np.zeros(3)
+        for name in (f"{side}_hand", f"{side}_finger_1_link", f"{side}_finger_2_link"):
+            body = self.plant.GetBodyByName(name)
+            mass += body.default_mass()
+            moment += body.default_mass() * (body.EvalPoseInWorld(self.context) @ body.default_com())
+        return mass, moment / mass
 
 
 @pytest.fixture(scope="module")
@@ -104,17 +109,9 @@ def test_joint_limits_are_the_models(model):
 def test_the_hands_weight_beyond_the_sensor_is_the_models(model, side, opening):
     fingers = {f"{side}_finger_{k}": opening / 2 for k in (1, 2)}
     model.set_arm(side, HOME if side == LEFT else HOME * MIRROR, **fingers)
-    bodies = model.hand(side)
-    mass = sum(model.plant.get_body(b).default_mass() for b in bodies)
+    mass, p_WHand = model.hand(side)
     assert GEOMETRY.hand_mass == pytest.approx(mass, abs=1e-6)
-    p_BHand = sum(
-        model.plant.get_body(b).default_mass() * model.plant.EvalBodyPoseInWorld(model.context, model.plant.get_body(b)).multiply(
-            model.plant.get_body(b).default_com()
-        )
-        for b in bodies
-    ) / mass  # fmt: skip
-    X_SB = inverse(model.pose(f"{side}_ft"))
-    p_SHand = X_SB[:, :3] @ p_BHand + X_SB[:, 3]
+    p_SHand = apply(inverse(model.pose(f"{side}_ft")), p_WHand)  # W is B here
     mirrored = np.array(GEOMETRY.p_SHand) * [lateral(side), 1, 1]
     assert p_SHand == pytest.approx(mirrored, abs=5e-5)
 
@@ -219,7 +216,9 @@ def test_a_straight_wrist_keeps_its_roll():
 def test_out_of_reach_is_none(side):
     X = GEOMETRY.arm_forward(np.zeros(6), side)
     assert GEOMETRY.arm_inverse(make(X[:, :3], X[:, 3] + [0.001, 0, 0]), side) is None  # beyond the straight arm
-    assert GEOMETRY.arm_inverse(make(X[:, :3], GEOMETRY.shoulder(side) + [0.245, 0, 0]), side) is None  # in the shoulder
+    assert (
+        GEOMETRY.arm_inverse(make(X[:, :3], GEOMETRY.shoulder(side) + [0.245, 0, 0]), side) is None
+    )  # in the shoulder
     assert GEOMETRY.arm_inverse(np.full((3, 4), np.nan), side) is None
 
 

@@ -49,7 +49,11 @@ def test_ports_are_those_of_the_tables_in_order():
 
 @pytest.mark.parametrize(
     "timing, first, period",
-    [({}, SLOT, TICK), ({"slot": 3}, 3 * SLOT, TICK), ({"period": 1 / 16, "slot": 2, "delay": 1 / 32}, 2 * SLOT + 1 / 32, 1 / 16)],
+    [
+        ({}, SLOT, TICK),
+        ({"slot": 3}, 3 * SLOT, TICK),
+        ({"period": 1 / 16, "slot": 2, "delay": 1 / 32}, 2 * SLOT + 1 / 32, 1 / 16),
+    ],
 )
 def test_steps_come_at_exact_times(timing, first, period):
     rig = Rig(Counter(**timing)).run(1.0)

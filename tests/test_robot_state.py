@@ -26,9 +26,7 @@ def rig(**changes) -> Rig:
 
 
 def test_ports_are_the_measurements_of_the_station_contract():
-    measured = {
-        s.name: f"in {s.kind}" for s in CONTRACT if s.direction == "out" and isinstance(s.kind, int)
-    }
+    measured = {s.name: f"in {s.kind}" for s in CONTRACT if s.direction == "out" and isinstance(s.kind, int)}
     found = ports(RobotStateSystem())
     assert found.pop("robot_state") == "out abstract"
     assert found == measured

@@ -59,7 +59,7 @@ def test_the_shipped_references_look_at_the_grip_point_from_outside_the_hand():
         x, y = taught[side].corners.T
         polygon = abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2
         assert taught[side].area == pytest.approx(polygon, rel=0.01)
-        assert taught[side].feature[2] == pytest.approx(taught[side].area**-0.5, rel=0.01)
+        assert taught[side].feature[2] == pytest.approx(taught[side].area ** -0.5, rel=0.01)
 
 
 def change(path, edit) -> None:

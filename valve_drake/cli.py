@@ -83,6 +83,42 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("log", type=Path)
     p.add_argument("-o", "--out", type=Path, required=True)
     p.set_defaults(command=_recover)
+
+    p = commands.add_parser("estimate", help="the pose of a red rectangle in one photograph, or a stereo pair")
+    p.add_argument("left", type=Path, metavar="LEFT")
+    p.add_argument("right", type=Path, metavar="RIGHT", nargs="?")
+    p.add_argument("--calibration", type=Path, required=True, nargs="+", metavar="FILE", help="ROS pairs: two files")
+    p.add_argument("--marker", required=True, metavar="98x100", help="width and height of the rectangle [mm]")
+    p.add_argument("--method", choices=("refined", "paper"), default="refined")
+    p.add_argument("--camera", choices=("left", "right"), default="left", help="of a head, that a single image is from")
+    p.add_argument("--draw", type=Path, metavar="FILE", help="the photographs with all that was seen")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(command=_estimate)
+
+    kinds = commands.add_parser("calibrate", help="cameras from images of a chessboard").add_subparsers(
+        required=True, metavar="WHAT", parser_class=_Parser
+    )
+    for name, what in (
+        ("intrinsics", "one camera"),
+        ("stereo", "the stereo head"),
+        ("hand-eye", "a camera on the hand, or beside the robot"),
+    ):
+        p = kinds.add_parser(name, help=what)
+        for key in ("--left", "--right") if name == "stereo" else ("--images",):
+            p.add_argument(key, required=True, nargs="+", metavar="GLOB")
+        if name == "hand-eye":
+            p.add_argument("--poses", type=Path, required=True, help='JSON: [{"image": name, "X_BE": 4x4, m}, ...]')
+            p.add_argument("--camera", type=Path, metavar="FILE", help="its lens (default: from the same images)")
+            p.add_argument("--eye-to-hand", action="store_true", help="the camera stands, the hand holds the board")
+        else:
+            p.add_argument("--distances", metavar="MM,...", help="of boards that all face the camera, in order")
+            p.add_argument("--lens", choices=("opencv", "paper", "best"), default="opencv", help="what to write")
+        p.add_argument("--board", required=True, metavar="9x6", help="inner corners, x by y")
+        p.add_argument("--pitch", required=True, metavar="25x25", help="of the corners, x by y [mm]")
+        p.add_argument("--out", type=Path, required=True, metavar="FILE", help="the calibration, YAML")
+        p.add_argument("--html", type=Path, metavar="FILE", help="the report as a page")
+        p.add_argument("--json", action="store_true", help="print the report as one JSON object")
+        p.set_defaults(command=_calibrate, kind=name)
     return parser
 
 
@@ -218,8 +254,10 @@ def _print_summary(console: object, s: object) -> None:
         table.add_row(span.mode + retry, f"{span.start:.2f}", f"{span.duration:.2f}", escape(span.reason))
     console.print(table)
     color = "green" if s.outcome == "done" else "red"
-    console.print(f"[bold {color}]{s.outcome or 'unfinished'}[/]  verdict [bold]{s.verdict or '-'}[/]  {escape(s.reason)}")
-    angles = {"commanded": s.command_rad, "camera": s.angle_camera_rad, "hands": s.angle_hands_rad, "true": s.angle_true_rad}
+    verdict = s.verdict or "-"
+    console.print(f"[bold {color}]{s.outcome or 'unfinished'}[/]  verdict [bold]{verdict}[/]  {escape(s.reason)}")
+    angles = {"commanded": s.command_rad, "camera": s.angle_camera_rad}
+    angles |= {"hands": s.angle_hands_rad, "true": s.angle_true_rad}
     known = [f"{k} {round(math.degrees(v), 2) + 0.0:.2f} deg" for k, v in angles.items() if v is not None]
     if known:
         console.print("turned: " + "  ".join(known))
@@ -287,7 +325,8 @@ def _print_review(found: list, subject: object) -> None:
         return
     first = subject.first
     if first is None:
-        console.print(f"{'[bold green]identical[/]' if subject.sound else 'no difference'}: what both hold is equal to the bit")
+        word = "[bold green]identical[/]" if subject.sound else "no difference"
+        console.print(f"{word}: what both hold is equal to the bit")
         return
     a, b = parting_values(first)
     words = f"{first.field}: {a} and {b}" if first.field else f"only in {found[0 if b is None else 1].log.path}"
@@ -408,3 +447,125 @@ def _recover(options: argparse.Namespace) -> int:
     for line in source.damage:
         print(f"  {line}")
     return DAMAGED if source.damage else OK
+
+
+# ---------------------------------------------------------------- photographs
+
+
+def _estimate(options: argparse.Namespace) -> int:
+    import time
+
+    import numpy as np
+
+    from valve_drake import frames
+    from valve_drake.camera.board import parse_pair, read_image
+    from valve_drake.camera.calibration_file import load_calibration
+    from valve_drake.camera.lens import StereoHead
+    from valve_drake.perception.photograph import look
+
+    size = parse_pair(options.marker, "--marker", "98x100 (mm)")
+    if not all(5 <= length <= 2000 for length in size):
+        raise ConfigError(f"--marker must be two lengths within 5..2000 mm, got {options.marker!r}")
+    if len(options.calibration) > 2:
+        raise ConfigError(f"--calibration must be one file, or the two of a ROS pair, got {len(options.calibration)}")
+    cameras = load_calibration(options.calibration)
+    head = isinstance(cameras, StereoHead)
+    if options.right is not None and not head:
+        raise ConfigError(f"calibration {options.calibration[0]}: of one camera, but there are two images")
+    paths = [path for path in (options.left, options.right) if path is not None]
+    sides = ["left", "right"] if len(paths) == 2 else [options.camera]
+    if len(paths) == 1 and head:
+        cameras = getattr(cameras, options.camera)
+    images = [np.ascontiguousarray(read_image(path)[:, :, ::-1]) for path in paths]
+    for _ in range(2):  # the first look also loads and allocates: the second is what a robot would wait for
+        start = time.perf_counter()
+        seen = look(images, cameras, (size[0] / 1e3, size[1] / 1e3), options.method)
+        took = time.perf_counter() - start
+    found = seen.estimate
+    corners: dict[str, list | None] = {"left": None, "right": None}
+    corners |= {side: None if px is None else px.tolist() for side, px in zip(sides, seen.corners_px)}
+    if options.draw:
+        from valve_drake.perception.overlay import overlay
+
+        lenses = cameras.lenses() if len(paths) == 2 else [cameras]
+        X_CL = [np.eye(3, 4), frames.inverse(cameras.X_LR)] if len(paths) == 2 else [np.eye(3, 4)]
+        _write_image(options.draw, overlay(seen, lenses, X_CL, (size[0] / 1e3, size[1] / 1e3)))
+    if options.json:
+        out = {
+            "found": found.found,
+            "method": options.method,
+            "camera": sides[0],
+            "X_CV": found.X_LV.tolist() if found.found else None,
+            "covariance": found.covariance.tolist() if found.found else None,
+            "corners_px": corners,
+            "ambiguity": found.ambiguity if found.found else None,
+            "residual_px": found.residual_px if found.found else None,
+            "epipolar_px": seen.epipolar_px if len(paths) == 2 and found.found else None,
+            "time_ms": 1e3 * took,
+            "reason": found.reason,
+        }
+        print(json.dumps(out))
+    elif found.found:
+        x, y, z = 1e3 * found.X_LV[:, 3]
+        sigma = np.sqrt(np.diag(found.covariance))
+        print(f"found by {options.method} in the {sides[0]} camera's frame, {1e3 * took:.1f} ms")
+        print(f"position  {x:.2f} {y:.2f} {z:.2f} mm  +- {' '.join(f'{1e3 * s:.2f}' for s in sigma[3:])}")
+        turn, spread = np.degrees([frames.rotation_vector(found.X_LV[:, :3]), sigma[:3]])
+        print(f"rotation  {' '.join(f'{a:.3f}' for a in turn)} deg  +- {' '.join(f'{s:.3f}' for s in spread)}")
+        print(f"residual  {found.residual_px:.2f} px, mirrored pose worse by chi2 {found.ambiguity:.1f}")
+    else:
+        print(f"not found: {found.reason}")
+        for side, one in zip(sides, seen.seen):
+            for candidate in one.candidates:
+                u, v = candidate.center
+                print(f"  {side} ({u:.0f}, {v:.0f}) {candidate.area:.0f} px^2: {candidate.rejected or 'may be'}")
+    return OK if found.found else FAILED
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    from valve_drake.camera import calibration_report as reports
+    from valve_drake.camera.board import parse_board
+
+    board = parse_board(options.board, options.pitch)
+    if options.kind == "hand-eye":
+        report = reports.hand_eye(
+            options.images, options.poses, board, options.out, options.camera, options.eye_to_hand
+        )
+    else:
+        distances = None if options.distances is None else _millimetres(options.distances)
+        if options.kind == "stereo":
+            report = reports.stereo(options.left, options.right, board, options.out, options.lens, distances)
+        else:
+            report = reports.intrinsics(options.images, board, options.out, options.lens, distances)
+    if options.html:
+        try:
+            options.html.write_text(report.page, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"--html {options.html}: cannot be written ({type(error).__name__})") from error
+    print(json.dumps(report.numbers) if options.json else "\n".join(report.lines()))
+    return OK
+
+
+def _millimetres(text: str) -> list[float]:
+    try:
+        values = [float(part) / 1e3 for part in text.split(",")]
+    except ValueError:
+        values = [math.nan]
+    if not all(math.isfinite(value) and value > 0 for value in values):
+        raise ConfigError(f"--distances must be numbers > 0 in mm, like 600,700,800, got {text!r}")
+    return values
+
+
+def _write_image(path: Path, image: object) -> None:
+    import cv2
+
+    try:
+        ok, data = cv2.imencode(path.suffix, image)
+        if ok:
+            path.write_bytes(data.tobytes())
+    except cv2.error:
+        ok = False
+    except OSError as error:
+        raise ConfigError(f"--draw {path}: cannot be written ({type(error).__name__})") from error
+    if not ok:
+        raise ConfigError(f"--draw {path}: unknown kind of image, name it .png or .jpg")

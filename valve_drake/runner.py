@@ -131,7 +131,8 @@ def run(
     """Runs a scenario (distributions and all) and writes its log.
 
     html: where to put the 3D recording. meshcat_port: also serve it live there. truth: record the truth ports.
-    duration: stop then, whatever the mode [s]. live: also gets all that is logged. show: called every STEP. stop: True makes the operator's stop.
+    duration: stop then, whatever the mode [s]. live: also gets all that is logged. show: called every STEP.
+    stop: True makes the operator's stop.
     """
     scenario = resolve(scenario)
     scenario.check()

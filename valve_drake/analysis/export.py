@@ -24,7 +24,7 @@ FORMATS = ("csv", "npz")
 
 
 def write(log: LogReader, topic: str, form: str, path: Path) -> int:
-    """Writes a topic to a file -> number of messages. Raises ConfigError if there is no such topic or it cannot be written."""
+    """Writes a topic to a file -> number of messages. Raises ConfigError if there is none or it cannot be written."""
     rows = [(record.when, leaves(log.decode(record))) for record in log.records([topic])]
     try:
         if form == "csv":

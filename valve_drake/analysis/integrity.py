@@ -1,6 +1,7 @@
 """Is a log whole? Damage, messages that are missing, and gaps against the rate that each topic should have."""
 
 import dataclasses as dc
+import math
 
 import numpy as np
 
@@ -13,16 +14,22 @@ from valve_drake.recording.signals import BEHAVIORS, SLOW, TRUTH
 
 CAMERAS = HEAD + WRIST
 
-# What writes a message at every period while the program runs. A test holds this table to signals.py and to a log.
+# What the recorder itself writes at every period. A test holds these tables to signals.py.
 PERIODS: dict[str, float] = {
-    **{f"/{block}/command": TICK for block in BEHAVIORS},
-    **{topic: TICK for topic in ("/image_servo/servo", "/command_selector/report", "/joint_states", "/joint_commands")},
-    **{f"/{block}/status": TICK for block in ("valve_search", "base_approach")},
-    **{f"/{side}_wrist/wrench": TICK for side in SIDES},
-    **{topic: SLOW for topic in ("/supervisor/mode", "/robot_state/robot_state", "/health", "/tf")},
+    **{topic: TICK for topic in ("/joint_states", "/joint_commands", *(f"/{side}_wrist/wrench" for side in SIDES))},
     **{"/" + port.replace(".", "/"): SLOW for port in TRUTH},
     **{f"/{camera}/calibration": 1.0 for camera in CAMERAS},
 }
+# What a block says at every one of its steps, from the first to the last: its rate is the one seen in the log.
+STEADY = frozenset(
+    (
+        *(f"/{block}/command" for block in BEHAVIORS),
+        "/valve_search/status",
+        "/base_approach/status",
+        "/image_servo/servo",
+    )
+    + ("/command_selector/report", "/supervisor/mode", "/robot_state/robot_state", "/health", "/tf")
+)
 # What follows the cameras: only images that the mode asks for are taken, so there is no rate over the run.
 GATED = frozenset(
     ("/color_segmentation/segmentation", "/line_fitting/edges", "/stereo_positioning/position", "/handle_marker/marks")
@@ -43,7 +50,7 @@ class Gap:
 
 @dc.dataclass(frozen=True)
 class TopicRow:
-    """One topic's share of a log. kind: periodic, gated (follows the cameras) or changes (written when it changes)."""
+    """One topic's share of a log. kind: steady, gated (follows the cameras) or changes (written when it changes)."""
 
     topic: str
     schema: str
@@ -121,9 +128,10 @@ def examine(log: LogReader) -> Integrity:
 
 
 def _row(topic: str, schema: str, time: np.ndarray, number: np.ndarray, start: float, end: float) -> TopicRow:
-    period = PERIODS.get(topic)
-    kind = "periodic" if period else "gated" if topic in GATED else "changes"
     steps = np.diff(time)
+    median = float(np.median(steps)) if len(steps) else None
+    period = median if topic in STEADY else PERIODS.get(topic)
+    kind = "gated" if topic in GATED else "steady" if topic in STEADY or topic in PERIODS else "changes"
     holes = np.diff(np.concatenate([[-1], number])) - 1
     lost = int(np.maximum(holes, 0).sum())
     edges = np.concatenate([[start], time, [end]]) if len(time) else np.array([start, end])
@@ -136,14 +144,13 @@ def _row(topic: str, schema: str, time: np.ndarray, number: np.ndarray, start: f
     if len(steps):
         k = int(steps.argmax())
         silence = Gap(float(time[k]), float(time[k + 1]), 0)
-    median = float(np.median(steps)) if len(steps) else None
     return TopicRow(topic, schema, len(time), kind, period, median, lost, tuple(gaps), silence)
 
 
 def _between(edges: np.ndarray, k: int, period: float) -> int:
-    """Messages that should be inside gap k; the first and last interval have a message at one end only."""
-    inside = round((edges[k + 1] - edges[k]) / period) - 1
-    return int(inside + (k == 0) + (k == len(edges) - 2))
+    """Messages that should be inside gap k; the first and the last interval have a message at one end only."""
+    periods = (edges[k + 1] - edges[k]) / period
+    return math.floor(periods + 1e-6) if k in (0, len(edges) - 2) else round(periods) - 1
 
 
 def words(row: TopicRow, most: int = 3) -> str:

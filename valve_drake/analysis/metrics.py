@@ -113,7 +113,11 @@ def summarize(log: str | os.PathLike | LogReader | Traces) -> Summary:
     out.faults = log.faults
     if log.selector is not None:
         did = log.selector
-        out.selector_limited, out.selector_refused, out.selector_tripped = did["limited"], did["refused"], did["tripped"]
+        out.selector_limited, out.selector_refused, out.selector_tripped = (
+            did["limited"],
+            did["refused"],
+            did["tripped"],
+        )
     return out
 
 

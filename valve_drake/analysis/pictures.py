@@ -1,4 +1,4 @@
-"""Camera images of a log as thumbnails, with what was detected in them drawn over: at changes of mode, at a given time."""
+"""Camera images of a log as thumbnails, with what was detected in them drawn over."""
 
 import base64
 import dataclasses as dc
@@ -22,7 +22,7 @@ TEXTS = 3  # of the detections' words, in one image
 
 @dc.dataclass(frozen=True)
 class Thumbnail:
-    """One image: `data` for an <img>, "" if it cannot be decoded; `overlay` is an SVG of `size` (width, height) [px]."""
+    """One image: `data` for an <img>, "" if it cannot be decoded; `overlay` an SVG of `size` (width, height) [px]."""
 
     camera: str
     time: float  # of capture [s]

@@ -19,7 +19,11 @@ BAND_BREAK = 1.1  # the same for bands [s]
 
 @dc.dataclass(frozen=True)
 class Line:
-    """One curve. style: line, dots or rings (larger and paler, to lie under dots). sigma: a band of twice this to both sides is drawn behind it."""
+    """One curve.
+
+    style: line, dots, or rings (larger and paler, to lie under dots). sigma: a band of twice this to both sides is
+    drawn behind it.
+    """
 
     label: str
     time: np.ndarray  # [s]
@@ -99,11 +103,11 @@ class Plot:
         return sorted([-v for v in sizes] + [0.0] + sizes)
 
 
-def shades(spans: Iterable, height: float) -> str:
+def shades(spans: Iterable, tall: float) -> str:
     """The modes as tinted areas, in seconds across."""
     return "".join(
-        f'<rect class="m-{escape(s.mode)}" x="{s.start:.4f}" y="0" width="{max(s.end - s.start, 0):.4f}" height="{height}"/>'
-        for s in spans
+        f'<rect class="m-{escape(span.mode)}" x="{span.start:.4f}" y="0" width="{span.duration:.4f}" height="{tall}"/>'
+        for span in spans
     )
 
 

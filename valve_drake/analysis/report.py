@@ -18,19 +18,15 @@ from markupsafe import Markup
 
 from valve_drake.analysis import two_logs
 from valve_drake.analysis.comparison import Divergence
+from valve_drake.analysis.curves import make_plots, overlaid
 from valve_drake.analysis.integrity import Integrity, examine, words
 from valve_drake.analysis.metrics import Summary, summarize
 from valve_drake.analysis.pictures import Album, Moment
-from valve_drake.analysis.plots import LEFT, RIGHT, WIDTH, Line, Plot, nice_ticks
-from valve_drake.analysis.traces import ARMS, ModeSpan, Traces
-from valve_drake.messages import SIDES, Mode
+from valve_drake.analysis.plots import LEFT, RIGHT, WIDTH, nice_ticks
+from valve_drake.analysis.traces import ModeSpan, Traces
+from valve_drake.messages import Mode
 from valve_drake.recording.reader import LogReader
-from valve_drake.recording.signals import TORSO
 
-BLUE, ORANGE, GREEN, BLACK, GREY = "#0b62a8", "#d1500c", "#157f4c", "#1b1b1b", "#8a8f98"
-PURPLE, RED = "#7a3fa0", "#c1272d"
-SIDE_COLORS = dict(zip(SIDES, (BLUE, ORANGE)))
-AXES = tuple(zip("xyz", (RED, GREEN, BLUE)))
 AT_REST = (Mode.MEASURE, Mode.VERIFY)
 ROW = 22  # of the timeline [px]
 LONGEST = 48  # text of a value where two logs part [characters]
@@ -170,7 +166,7 @@ def _parting(found: Divergence | None) -> dict[str, Any] | None:
 
 
 def parting_values(found: Divergence) -> tuple[str | float | None, str | float | None]:
-    """What the two logs have where they part: numbers as they are, anything else as a short text, None for no message."""
+    """What both logs have where they part: numbers as they are, else a short text; None for no message."""
 
     def brief(value: Any) -> str | float | None:
         if value is None or isinstance(value, int | float):
@@ -204,189 +200,27 @@ def page(found: Review, beside: Path) -> str:
     plots = [plot for plot in make_plots(found.traces) if plot.lines]
     album = Album(found.log)
     worst = _worst(found, album)
-    return _environment().get_template("review.html.j2").render(
-        title=f"{found.name}: {found.summary.verdict or found.summary.outcome or 'unfinished'}",
-        r=found,
-        s=found.summary,
-        integrity=found.integrity,
-        tiles=tiles(found.summary),
-        timeline=timeline(spans, start, end, found.integrity.gaps()),
-        plots=[(plot, plot.svg(spans, start, end)) for plot in plots],
-        missing=found.traces.missing,
-        spans=spans,
-        span=(start, end),
-        moments=album.changes_of_mode(spans),
-        worst=worst,
-        log_lines=_log_lines(found.log),
-        recording=os.path.relpath(found.recording, beside) if found.recording else None,
-        geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
-    )
-
-
-def make_plots(log: Traces) -> list[Plot]:
-    """All plots of a run; those without lines have nothing in this log."""
-    return [
-        _distance(log),
-        _position_error(log),
-        _angle_error(log),
-        _servo_error(log),
-        _servo_speed(log),
-        _forces(log),
-        _couple(log),
-        _angle(log),
-        _angle_difference(log),
-        _tracking(log),
-        _health(log),
-    ]
-
-
-def _distance(log: Traces) -> Plot:
-    lines = []
-    found = log.estimates
-    if found is not None and log.truth is not None and log.joints is not None:
-        time = log.joints.time[::8]
-        true = log.true_X_LV(time)
-        if true is not None:
-            lines.append(Line("true", time, np.linalg.norm(true[:, :, 3], axis=1), GREY))
-    if log.stereo is not None:
-        lines.append(Line("stage 1, stereo", *log.stereo, ORANGE, "rings"))
-    if found is not None and len(found.time):
-        lines.append(Line("stage 2, rectangle", found.time, found.distance, BLUE, "dots"))
-    return Plot("Distance of the marker", "m", lines, low=0.0, key="distance")
-
-
-NOMINAL = (
-    "Zero is the truth, taken through the nominal head kinematics: the true base and marker poses are recorded, the"
-    " head\u2019s mount and its small error are not, so a steady offset of a few millimetres is the mount\u2019s."
-    " Bands are the estimate\u2019s own 2 \u03c3."
-)
-
-
-def _position_error(log: Traces) -> Plot:
-    return _pose_error(log, "Marker position: estimate minus truth, in the left camera", "mm", 1e3, 3, NOMINAL, "position_error")
-
-
-def _angle_error(log: Traces) -> Plot:
-    note = "About the marker\u2019s own axes, modulo the half turn after which a rectangle looks the same."
-    return _pose_error(log, "Marker orientation: estimate minus truth", "deg", math.degrees(1), 0, note, "angle_error")
-
-
-def _pose_error(log: Traces, title: str, unit: str, scale: float, first: int, note: str, key: str) -> Plot:
-    found = log.estimates
-    lines = []
-    if found is not None and len(found.time) and np.isfinite(found.error).all():
-        for k, (axis, color) in enumerate(AXES):
-            error, sigma = scale * found.error[:, first + k], scale * found.sigma[:, first + k]
-            lines.append(Line(axis, found.time, error, color, "dots", sigma=sigma))
-    return Plot(title, unit, lines, note, height=190, knee=0.5 if first else 0.1, key=key)
-
-
-def _servo_error(log: Traces) -> Plot:
-    lines = _by_side(log.servo, "error", 1e3)
-    return Plot("Image servo: distance of each hand from its reference", "mm", lines, low=0.0, height=120, key="servo_error")
-
-
-def _servo_speed(log: Traces) -> Plot:
-    lines = _by_side(log.servo, "speed", 1e3)
-    return Plot("Image servo: speed of each hand, measured", "mm/s", lines, low=0.0, height=110, key="servo_speed")
-
-
-def _by_side(series: dict[str, np.ndarray] | None, what: str, scale: float) -> list[Line]:
-    if series is None:
-        return []
-    return [
-        Line(side, series["time"], scale * series[f"{side}_{what}"], SIDE_COLORS[side])
-        for side in SIDES
-        if f"{side}_{what}" in series
-    ]
-
-
-def _forces(log: Traces) -> Plot:
-    lines = []
-    if (turn := log.turn) is not None:
-        t = turn["time"]
-        lines = [Line(f"{side} hand", t, turn[f"force_{side}"], SIDE_COLORS[side]) for side in SIDES]
-        lines += [
-            Line("internal (squeeze)", t, turn["squeeze"], PURPLE),
-            Line("on the stem beyond the couple", t, turn["stem_force"], GREEN),
-        ]
-    note = "Magnitudes, without the hands\u2019 weight and the sensors\u2019 bias; the internal force is signed, positive compresses the bar."
-    return Plot("Forces on the hands", "N", lines, note, height=170, low=0.0, key="forces")
-
-
-def _couple(log: Traces) -> Plot:
-    lines = []
-    if (turn := log.turn) is not None:
-        t = turn["time"]
-        lines = [Line("couple on the valve", t, turn["torque"], BLACK)]
-        lines += [Line(f"moment at the {side} grip", t, turn[f"moment_{side}"], SIDE_COLORS[side]) for side in SIDES]
-    return Plot("Couple and moments", "N m", lines, height=130, low=0.0, key="couple")
-
-
-def _angle(log: Traces) -> Plot:
-    lines = []
-    scale = math.degrees(1)
-    if log.truth is not None:
-        lines.append(Line("true", log.truth.time, scale * log.truth.angle, GREY))
-    if log.turn is not None:
-        working = log.inside(log.turn["time"], Mode.GRASP, Mode.TURN, Mode.RELEASE)
-        t = log.turn["time"][working]
-        lines.append(Line("reference", t, scale * log.turn["angle_reference"][working], BLACK, dashed=True))
-        lines.append(Line("by the hands", t, scale * log.turn["angle"][working], ORANGE))
-    if log.camera_angle is not None:
-        time, angle = log.camera_angle
-        lines.append(Line("by the head cameras", time, scale * angle, BLUE, "dots"))
-    return Plot("Valve angle, positive opens", "deg", lines, height=170, key="valve_angle")
-
-
-def _angle_difference(log: Traces) -> Plot:
-    lines = []
-    scale = math.degrees(1)
-    if (truth := log.truth) is not None:
-        if log.turn is not None:
-            at = log.inside(log.turn["time"], Mode.TURN)
-            t = log.turn["time"][at]
-            zero = np.interp(t[:1], truth.time, truth.angle)
-            off = log.turn["angle"][at] - (np.interp(t, truth.time, truth.angle) - zero)
-            lines.append(Line("by the hands", t, scale * off, ORANGE))
-        if log.camera_angle is not None:
-            time, angle = log.camera_angle
-            seen = log.inside(time, Mode.MEASURE, Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE, Mode.VERIFY)
-            off = (angle - np.interp(time, truth.time, truth.angle))[seen]
-            lines.append(Line("by the head cameras", time[seen], scale * off, BLUE, "dots"))
-    return Plot("Valve angle: belief minus truth", "deg", lines, "From the measurement at rest on.", height=120, key="angle_error_valve")
-
-
-def _tracking(log: Traces) -> Plot:
-    groups = [("torso", TORSO, GREEN)] + [(f"{side} arm", ARMS[side], SIDE_COLORS[side]) for side in SIDES]
-    lines = []
-    if log.joints is not None:
-        for label, names, color in groups:
-            error = np.abs(log.joints.error(names))
-            if error.size and np.isfinite(error).all():
-                lines.append(Line(label, log.joints.time, 1e3 * error.max(axis=1), color))
-    return Plot("Joint tracking: largest difference of a group", "mrad", lines, low=0.0, height=130, key="tracking")
-
-
-def _health(log: Traces) -> Plot:
-    lines = []
-    if log.health is not None:
-        time, devices, ages = log.health
-        groups = (
-            ("head cameras", [d for d in devices if d.startswith("head")], BLUE),
-            ("wrist cameras", [d for d in devices if d.endswith("_wrist")], ORANGE),
-            ("all others", [d for d in devices if not d.startswith("head") and not d.endswith("_wrist")], GREEN),
+    return (
+        _environment()
+        .get_template("review.html.j2")
+        .render(
+            title=f"{found.name}: {found.summary.verdict or found.summary.outcome or 'unfinished'}",
+            r=found,
+            s=found.summary,
+            integrity=found.integrity,
+            tiles=tiles(found.summary),
+            timeline=timeline(spans, start, end, found.integrity.gaps()),
+            plots=[(plot, plot.svg(spans, start, end)) for plot in plots],
+            missing=found.traces.missing,
+            spans=spans,
+            span=(start, end),
+            moments=album.changes_of_mode(spans),
+            worst=worst,
+            log_lines=_log_lines(found.log),
+            recording=os.path.relpath(found.recording, beside) if found.recording else None,
+            geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
         )
-        for label, names, color in groups:
-            if names:
-                age = ages[:, [devices.index(name) for name in names]].max(axis=1)
-                lines.append(Line(label, time, age, color))
-    note = "A simulated station has no silent devices: zero throughout."
-    return Plot("Health: age of the oldest report of a group", "s", lines, note if _all_zero(lines) else "", height=96, low=0.0, high=0.1, key="health")
-
-
-def _all_zero(lines: Sequence[Line]) -> bool:
-    return all(not line.value.any() for line in lines)
+    )
 
 
 # ---------------------------------------------------------------- the page of two
@@ -400,48 +234,27 @@ def comparison_page(found: Comparison, beside: Path) -> str:
     plots = overlaid(make_plots(a.traces), make_plots(b.traces), found.modes)
     headline = {"modes", "estimates", "tracking", "mode_durations_s", "selector_limited", "selector_refused"}
     main = [row for row in found.numbers if row[0].split(".")[0] not in headline]
-    return _environment().get_template("compare.html.j2").render(
-        title=f"{a.name} and {b.name}",
-        c=found,
-        a=a,
-        b=b,
-        first=found.first,
-        values=parting_values(found.first) if found.first else None,
-        parting_values=parting_values,
-        main=main,
-        others=[row for row in found.numbers if row not in main],
-        timelines=[timeline(r.traces.spans, *_extent(r.log), r.integrity.gaps()) for r in (a, b)],
-        plots=[(plot, plot.svg(spans, start, end)) for plot in plots],
-        spans=spans,
-        span=(start, end),
-        recordings=[os.path.relpath(r.recording, beside) if r.recording else None for r in (a, b)],
-        geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
+    return (
+        _environment()
+        .get_template("compare.html.j2")
+        .render(
+            title=f"{a.name} and {b.name}",
+            c=found,
+            a=a,
+            b=b,
+            first=found.first,
+            values=parting_values(found.first) if found.first else None,
+            parting_values=parting_values,
+            main=main,
+            others=[row for row in found.numbers if row not in main],
+            timelines=[timeline(r.traces.spans, *_extent(r.log), r.integrity.gaps()) for r in (a, b)],
+            plots=[(plot, plot.svg(spans, start, end)) for plot in plots],
+            spans=spans,
+            span=(start, end),
+            recordings=[os.path.relpath(r.recording, beside) if r.recording else None for r in (a, b)],
+            geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
+        )
     )
-
-
-def overlaid(first: Sequence[Plot], second: Sequence[Plot], pairs: two_logs.Pairs) -> list[Plot]:
-    """The plots of the first run with the second's curves in paler colours, laid mode over mode."""
-    out = []
-    for plot, other in zip(first, second):
-        theirs = [
-            dc.replace(
-                line,
-                label=f"B: {line.label}",
-                time=two_logs.onto(pairs, line.time),
-                color=_paler(line.color),
-                dashed=line.style == "line",
-                sigma=None,
-            )
-            for line in other.lines
-        ]
-        ours = [dc.replace(line, label=f"A: {line.label}", sigma=None) for line in plot.lines]
-        if ours or theirs:
-            out.append(dc.replace(plot, lines=theirs + ours, note=""))
-    return out
-
-
-def _paler(color: str) -> str:
-    return "#" + "".join(f"{round(0.45 * int(color[k : k + 2], 16) + 0.55 * 255):02x}" for k in (1, 3, 5))
 
 
 def _extent(log: LogReader) -> tuple[float, float]:
@@ -483,7 +296,9 @@ def timeline(spans: Sequence[ModeSpan], start: float, end: float, gaps: Sequence
         middle = ROW * len(modes) + ROW / 2
         out.append(f'<text class="name bad" x="{left - 8}" y="{middle + 4}">missing</text>')
         for a, b in gaps:
-            out.append(f'<rect class="gap" x="{x(a):.1f}" y="{middle - 8}" width="{max(x(b) - x(a), 2):.1f}" height="16"/>')
+            out.append(
+                f'<rect class="gap" x="{x(a):.1f}" y="{middle - 8}" width="{max(x(b) - x(a), 2):.1f}" height="16"/>'
+            )
     out.append("</svg>")
     return Markup("".join(out))
 
@@ -503,7 +318,9 @@ def tiles(s: Summary) -> list[tuple[str, str, str]]:
         if value is not None:
             out.append((label, show(value), remark))
 
-    degrees: Callable[[float], str] = lambda v: f"{round(math.degrees(v), 2) + 0.0:.2f}\u00b0"  # noqa: E731
+    def degrees(value: float) -> str:
+        return f"{round(math.degrees(value), 2) + 0.0:.2f}\u00b0"  # no negative zero
+
     add("commanded", s.command_rad, degrees)
     add("seen by the cameras", s.angle_camera_rad, degrees, _off(s.angle_camera_rad, s.angle_true_rad))
     add("felt by the hands", s.angle_hands_rad, degrees, _off(s.angle_hands_rad, s.angle_true_rad))
@@ -511,14 +328,24 @@ def tiles(s: Summary) -> list[tuple[str, str, str]]:
     add("simulated time" if s.angle_true_rad is not None else "time", s.sim_time_s, lambda v: f"{v:.1f} s")
     add("retries", s.retries, str)
     if s.turn_peak_torque_Nm is not None:
-        stem = f"on the stem beyond the couple: mean {s.turn_mean_stem_force_N:.1f} N, peak {s.turn_peak_stem_force_N:.1f} N"
-        add("peak force of a hand", s.turn_peak_hand_force_N, lambda v: f"{v:.1f} N", f"mean {s.turn_mean_hand_force_N:.1f} N")
+        force, stem = s.turn_mean_hand_force_N, s.turn_peak_stem_force_N
+        add("peak force of a hand", s.turn_peak_hand_force_N, lambda v: f"{v:.1f} N", f"mean {force:.1f} N")
         add("couple", s.turn_mean_torque_Nm, lambda v: f"{v:.1f} N m", f"peak {s.turn_peak_torque_Nm:.1f} N m")
-        out.append(("load on the stem", f"{s.turn_mean_stem_force_N:.2f} N", f"peak {s.turn_peak_stem_force_N:.1f} N, beyond the couple"))
-        add("left hand\u2019s share", s.turn_share_left, lambda v: f"{100 * v:.1f} %", stem and "of the couple")
+        add(
+            "load on the stem",
+            s.turn_mean_stem_force_N,
+            lambda v: f"{v:.2f} N",
+            f"beyond the couple; peak {stem:.1f} N",
+        )
+        add("left hand\u2019s share", s.turn_share_left, lambda v: f"{100 * v:.1f} %", "of the couple")
     rest = s.estimates.get(Mode.MEASURE)
     if rest is not None and rest.position_rms_m is not None:
-        add("pose measured at rest", rest.position_rms_m, lambda v: f"{1e3 * v:.2f} mm", f"{math.degrees(rest.angle_rms_rad):.2f}\u00b0 off, head mount included")
+        add(
+            "pose measured at rest",
+            rest.position_rms_m,
+            lambda v: f"{1e3 * v:.2f} mm",
+            f"{math.degrees(rest.angle_rms_rad):.2f}\u00b0 off, head mount included",
+        )
     if s.servo_final_error_m:
         worst = max(s.servo_final_error_m.values())
         add("hands before the grasp", worst, lambda v: f"{1e3 * v:.2f} mm", "worse hand, by its own image")
@@ -528,7 +355,7 @@ def tiles(s: Summary) -> list[tuple[str, str, str]]:
 def _off(value: float | None, other: float | None, name: str = "truth") -> str:
     if value is None or other is None:
         return ""
-    off = round(math.degrees(value - other), 2) + 0.0  # no negative zero
+    off = round(math.degrees(value - other), 2) + 0.0
     return f"{off:+.2f}\u00b0 to the {name}".replace("-", "\u2212")
 
 
@@ -565,7 +392,9 @@ def _label(mode: str) -> str:
 
 def _environment() -> jinja2.Environment:
     loader = jinja2.PackageLoader("valve_drake", "analysis")
-    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
     environment.filters |= {"label": _label, "rate": _rate, "words": words, "size": _size}
     environment.globals |= {"degrees": math.degrees, "AT_REST": AT_REST}
     return environment

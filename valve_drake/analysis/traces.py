@@ -21,6 +21,21 @@ from valve_drake.recording.reader import LogReader
 from valve_drake.recording.signals import TORSO
 
 ARMS = {side: tuple(f"{side}_arm_{k}" for k in range(1, 7)) for side in SIDES}
+SCHEMAS = {  # of the topics that are read here
+    "/supervisor/mode": "valve_drake.ModeState",
+    "/joint_states": "foxglove.JointStates",
+    "/joint_commands": "foxglove.JointStates",
+    "/rectangle_estimator/estimate": "valve_drake.RectangleEstimate",
+    "/stereo_positioning/position": "valve_drake.StereoPosition",
+    "/hybrid_rotation/turn": "valve_drake.TurnState",
+    "/image_servo/servo": "valve_drake.ServoState",
+    "/health": "valve_drake.Health",
+    "/command_selector/report": "valve_drake.SelectorReport",
+    "/kinematic_approach/status": "valve_drake.Status",
+    "/truth/base_pose": "valve_drake.Vector",
+    "/truth/marker_pose": "valve_drake.Vector",
+    "/truth/valve_angle": "valve_drake.Vector",
+}
 HALF_TURN = make(rot_z(np.pi), np.zeros(3))
 
 
@@ -317,16 +332,18 @@ class Traces:
         return angle
 
     def _messages(self, topic: str) -> list[tuple[float, Any]]:
-        """(time, message) of a topic; none if it is not there or from another version of the program."""
-        if topic not in self.reader.topics or self.reader.topics[topic].count == 0:
-            self.missing.setdefault(topic, "not in this log")
-            return []
-        try:
-            rows = [(time, message) for _, time, message in self.reader.messages([topic])]
-        except ConfigError as error:
-            self.missing[topic] = str(error)
-            return []
-        return rows
+        """(time, message) of a topic; none if it is not there or from another program."""
+        found = self.reader.topics.get(topic)
+        if found is None or found.count == 0:
+            self.missing[topic] = "not in this log"
+        elif found.schema != SCHEMAS[topic]:
+            self.missing[topic] = f"holds {found.schema}, not {SCHEMAS[topic]}"
+        else:
+            try:
+                return [(time, message) for _, time, message in self.reader.messages([topic])]
+            except ConfigError as error:
+                self.missing[topic] = str(error)
+        return []
 
 
 def interpolate(time: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -100,14 +100,14 @@ def compare_messages(a: LogReader, b: LogReader) -> list[TopicPair]:
             if x == y:
                 equal += 1
             elif not (x is None and partial[0]) and not (y is None and partial[1]):
-                first = _divergence(topic, *(_record(log, topic, at, number) for log, at in zip(logs, (x, y))), a, b)
+                first = _divergence(topic, _record(a, topic, x, number), _record(b, topic, y, number), a, b)
                 break
         out.append(TopicPair(topic, len(left), len(right), equal, first))
     return out
 
 
 def first_divergence(topics: Sequence[TopicPair]) -> Divergence | None:
-    """The earliest one; of those at one time, that of the topic recorded first, which is the order in which data flows."""
+    """The earliest one; of those at one time, that of the topic recorded first, which is how the data flows."""
     return min((pair.first for pair in topics if pair.first), key=lambda found: found.time, default=None)
 
 

@@ -72,7 +72,7 @@ class Hand:
     seen_at: float = 0.0
     error: np.ndarray = dc.field(default_factory=lambda: np.full(3, np.nan))
     inside: int = 0  # images in tolerance in a row
-    past: tuple[tuple[float, np.ndarray], ...] = ()  # (time, p_HG measured, plus what is missing to the command), newest last
+    past: tuple[tuple[float, np.ndarray], ...] = ()  # (time, p_HG measured plus what lacks to the command), newest last
 
 
 @dc.dataclass(frozen=True)
@@ -155,8 +155,8 @@ class ImageServo:
         p = hand.X_HG[:, 3] + step * min(1.0, most / max(length, 1e-12))
         X_HG = make(hand.X_HG[:, :3], p)
         solution = self.geometry.arm_inverse(X_HG, side, hand.q)
-        if solution is None or np.max(np.abs(solution - hand.q)) > 0.5:  # at the edge of reach, or the wrist would swing: stay
-            return hand
+        if solution is None or np.max(np.abs(solution - hand.q)) > 0.5:
+            return hand  # at the edge of reach, or the wrist would swing round: stay
         return dc.replace(hand, X_HG=X_HG, q=solution)
 
     def _judge(self, time: float, activation: int, hands: dict[str, Hand]) -> Status:

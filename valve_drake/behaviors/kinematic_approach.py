@@ -177,9 +177,11 @@ class KinematicApproach:
         if np.max(np.abs(goal - m.q)) < 1e-6:
             return dc.replace(m, phase="moving", path=None, since=time)
         limits = np.tile(ARM_LIMITS, 2)
-        points = find_path(
-            m.q, goal, self._vias(m.q, goal, X_BV), lambda q: bool(np.all(np.abs(q) <= limits)) and self.is_free(X_BV, q)
-        )
+
+        def is_free(q: np.ndarray) -> bool:
+            return bool(np.all(np.abs(q) <= limits)) and self.is_free(X_BV, q)
+
+        points = find_path(m.q, goal, self._vias(m.q, goal, X_BV), is_free)
         if points is None:
             return dc.replace(m, phase="blocked", path=None, since=time)
         path = Path(points, time, self.config.joint_speed, self.config.joint_acceleration)

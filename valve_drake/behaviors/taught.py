@@ -15,7 +15,7 @@ _SHAPES = {"feature": (3,), "jacobian": (3, 3), "area": (), "corners": (4, 2)}
 
 @dc.dataclass(frozen=True)
 class TaughtReference:
-    """What one hand was taught: s* (3,), J (3, 3) of image_servo's (2), and the mark's area [px^2] and corners [px] (4, 2)."""
+    """What one hand was taught: s* (3,), J (3, 3) of image_servo's (2); the mark's area [px^2], corners [px] (4, 2)."""
 
     feature: np.ndarray
     jacobian: np.ndarray

@@ -46,14 +46,16 @@ class Board:
 
 def parse_board(size: str, pitch: str) -> Board:
     """A board from "9x6" (inner corners, x by y) and "25x25" (pitch in mm, x by y). Raises ConfigError."""
-    counts, lengths = _pair(size, "--board", "9x6, inner corners x by y"), _pair(pitch, "--pitch", "25x25, mm x by y")
+    counts = parse_pair(size, "--board", "9x6 (inner corners, x by y)")
+    lengths = parse_pair(pitch, "--pitch", "25x25 (mm, x by y)")
     ok = all(n == int(n) and 3 <= n <= 100 for n in counts)
     require(ok, "--board", "two whole numbers of inner corners within 3..100, e.g. 9x6", size)
     require(all(0.1 <= p <= 1000 for p in lengths), "--pitch", "two lengths within 0.1..1000 mm, e.g. 25x25", pitch)
     return Board(int(counts[0]), int(counts[1]), lengths[0] / 1e3, lengths[1] / 1e3)
 
 
-def _pair(text: str, key: str, example: str) -> tuple[float, float]:
+def parse_pair(text: str, key: str, example: str) -> tuple[float, float]:
+    """Two finite numbers from "98x100". Raises ConfigError naming `key`."""
     parts = text.lower().replace("×", "x").split("x")
     try:
         values = [float(part) for part in parts]
@@ -68,13 +70,12 @@ def natural(name: str) -> list:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
 
 
-def find_images(pattern: str, key: str) -> list[Path]:
-    """The files of a glob, or of a folder, in natural order. Raises ConfigError if there are none."""
-    where = f"{pattern}/*" if Path(pattern).is_dir() else pattern
-    paths = sorted((Path(name) for name in glob(where) if Path(name).is_file()), key=lambda path: natural(path.name))
-    if not paths:
-        raise ConfigError(f"{key} {pattern}: no such image")
-    return paths
+def find_images(patterns: Sequence[str], key: str) -> list[Path]:
+    """The files of globs (a shell may have expanded them already), in natural order. Raises ConfigError if none."""
+    names = {name for pattern in patterns for name in glob(pattern) if Path(name).is_file()}
+    if not names:
+        raise ConfigError(f"{key} {' '.join(patterns)}: no such image")
+    return sorted(map(Path, names), key=lambda path: (natural(path.name), str(path)))
 
 
 def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:

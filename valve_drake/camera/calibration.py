@@ -29,7 +29,8 @@ KINDS = ("opencv", "paper")
 RANGES = (0.5, 1.0, 2.0)  # at which points are triangulated [m]
 MIN_VIEWS = 3
 _MAX_FOCAL_SIGMA = 0.02  # a focal length known less well than this (relative) is none
-_MIN_TILT = math.radians(8)  # between the steepest boards: less does not tell the focal length from the distance
+_MIN_TILT = 8.0  # of the steepest board, and between two: less does not tell the focal length from distance [deg]
+_TILT = "tilt it by up to 45 deg to all sides, or give --distances"
 _OUTLIER = 2.5  # times the median view's rms
 
 
@@ -183,7 +184,7 @@ class _Problem:
                     return math.inf, H, g, residuals
                 xy = Q[:, :2] / Q[:, 2:]
                 seen, D, own = self.kind.project(lens, xy)
-                D = D @ (np.concatenate([np.broadcast_to(np.eye(2), (len(Q), 2, 2)), -xy[:, :, None]], 2) / Q[:, 2, None, None])
+                D = D @ _divided(xy, Q[:, 2])
                 r = seen - px
                 columns = [np.arange(c * self.m, (c + 1) * self.m), np.arange(mine.start, mine.stop)]
                 blocks = [own, D @ dQ]
@@ -215,7 +216,7 @@ def _minimize(problem: Callable, state: Any, moved: Callable, steps: int = 200) 
     """Levenberg-Marquardt from `state` until no step is expected to matter -> the best state, problem(state)."""
     at = problem(state)
     if not math.isfinite(at[0]):
-        raise ConfigError("the calibration has no start: a board lies behind a camera")
+        raise ConfigError("the calibration has no start: do all images show the same board, and the poses belong to them?")
     damping = 1e-4
     for _ in range(steps):
         cost, H, g = at[:3]
@@ -275,7 +276,9 @@ def board_views(
     return views
 
 
-def calibrate(views: Sequence[View], size: tuple[int, int], kind: str = "opencv", board: Board | None = None) -> Calibration:
+def calibrate(
+    views: Sequence[View], size: tuple[int, int], kind: str = "opencv", board: Board | None = None
+) -> Calibration:
     """One camera or the stereo head (as many cameras as the views have), `size` = width, height [px].
 
     kind: opencv, paper, or best (the better of the two). Raises ConfigError for views that do not determine a camera.
@@ -283,7 +286,7 @@ def calibrate(views: Sequence[View], size: tuple[int, int], kind: str = "opencv"
     rigid = len(views) > 1 and views[0].body == views[-1].body
     least = 2 if rigid else MIN_VIEWS
     if len(views) < least:
-        raise ConfigError(f"{len(views)} usable view(s) of the board: a calibration needs at least {least}")
+        raise ConfigError(f"the board was found in {len(views)} view(s): a calibration needs at least {least}")
     # Boards that are all frontal show little of a lens: what they cannot tell must not be fitted.
     kinds = {"opencv": _OpenCvKind([0] if rigid else range(5)), "paper": _PaperKind()}
     fits = {}
@@ -293,8 +296,8 @@ def calibrate(views: Sequence[View], size: tuple[int, int], kind: str = "opencv"
         try:
             fits[name] = _solve(views, model, name, _State(lenses, *start[1:]), size)
         except np.linalg.LinAlgError as error:
-            raise ConfigError("the boards do not determine a camera: show them tilted, to all sides") from error
-    _refuse_degenerate(fits["opencv"], rigid)
+            raise ConfigError(f"degenerate: the boards do not determine a camera: {_TILT}") from error
+    _refuse_vague(fits["opencv"], rigid)
     better = min(fits, key=lambda name: _information(fits[name]))
     fit = fits[better if kind == "best" else kind]
     for side, lens in zip(("left", "right"), fit.lenses):
@@ -340,7 +343,9 @@ def _start(
             if np.isfinite(found[0]) and (best is None or found[0] < best[0]):
                 best = found
         if best is None:
-            raise ConfigError("the boards do not determine a camera: show them tilted, to all sides")
+            raise ConfigError(f"degenerate: the boards do not determine a camera: {_TILT}")
+        if not rigid:
+            _refuse_frontal([cv2.Rodrigues(rvec)[0][:, 2] for rvec in best[3]])
         alone.append((best[1], best[2].ravel(), best[3], best[4]))
         seen.append(px)
     lenses = [(K, dist) for K, dist, _, _ in alone]
@@ -355,32 +360,31 @@ def _start(
     return lenses, frames.inverse(frames.make(both[5], both[6].ravel())), poses
 
 
-def _refuse_degenerate(fit: Fit, rigid: bool) -> None:
+def _refuse_frontal(normals: Sequence[np.ndarray]) -> None:
+    """Raises ConfigError where all boards face the camera, or are parallel: normals (3,) in the camera."""
+    n = np.array(normals)
+    tilt = math.degrees(math.acos(float(np.clip(np.abs(n[:, 2]).min(), 0, 1))))
+    between = math.degrees(math.acos(float(np.clip((n @ n.T).min(), -1, 1))))
+    if min(tilt, between) < _MIN_TILT:
+        how = "faces the camera" if tilt < _MIN_TILT else "lies the same way"
+        raise ConfigError(
+            f"degenerate: the board {how} in every image (within {min(tilt, between):.0f} deg), so that its distance and "
+            f"the focal length cannot be told apart: {_TILT}"
+        )
+
+
+def _refuse_vague(fit: Fit, rigid: bool) -> None:
     """Raises ConfigError where the corners hardly determine the focal length."""
     sigma = fit.sigmas()
     focal = max(sigma[name] / value for name, value in parameters(fit).items() if name.split(".")[-1] in ("fx", "fy"))
-    tilt = tilts(fit)
-    advice = "tilt it by up to 45 deg to all sides, or give --distances"
-    if rigid:
-        advice = "the distances must differ and be those of the images in order"
-    elif max(tilt) < _MIN_TILT or _spread(fit) < _MIN_TILT:
-        raise ConfigError(
-            f"degenerate: the board faces the camera in every image (at most {math.degrees(max(tilt)):.0f} deg of tilt), "
-            f"so that its distance and the focal length cannot be told apart: {advice}"
-        )
     if not focal < _MAX_FOCAL_SIGMA:
+        advice = "the distances must be those of the images, in their order" if rigid else _TILT
         raise ConfigError(f"degenerate: the focal length is known to {100 * focal:.0f} % only: {advice}")
 
 
 def tilts(fit: Fit) -> list[float]:
     """Angle of each body's normal against the left camera's axis [rad]."""
     return [math.acos(float(np.clip(abs(X[2, 2]), 0, 1))) for X in fit.poses]
-
-
-def _spread(fit: Fit) -> float:
-    """Largest angle between the normals of two boards [rad]."""
-    normals = np.array([X[:, 2] for X in fit.poses])
-    return math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
 
 
 def _information(fit: Fit) -> float:
@@ -556,7 +560,11 @@ def closed_hand_eye(X_BE: Sequence[np.ndarray], X_CT: Sequence[np.ndarray]) -> n
 
 
 def hand_eye(
-    lens: LensModel, points: np.ndarray, corners: Sequence[np.ndarray], X_BE: Sequence[np.ndarray], to_hand: bool = False
+    lens: LensModel,
+    points: np.ndarray,
+    corners: Sequence[np.ndarray],
+    X_BE: Sequence[np.ndarray],
+    to_hand: bool = False,
 ) -> HandEye:
     """Hand-eye calibration: Park's method, then least squares of all corners' residuals.
 
@@ -574,7 +582,7 @@ def hand_eye(
     for k in everything if len(X_BE) > 3 else ():
         rest = [i for i in everything if i != k]
         try:
-            one = _refined_hand_eye(lens, points, [xy[i] for i in rest], [X_BE[i] for i in rest], [X_CT[i] for i in rest])
+            one = _refined_hand_eye(lens, points, *([of[i] for i in rest] for of in (xy, X_BE, X_CT)))
         except ConfigError:  # the view that alone brought a second axis
             left_out.append((math.nan, math.nan))
             continue
@@ -626,7 +634,7 @@ def _refined_hand_eye(
     R0 = boards[0][:, :3]
     turn = np.mean([frames.rotation_vector(R0.T @ B[:, :3]) for B in boards], axis=0)
     X_BT = frames.make(R0 @ frames.rotation(turn), np.mean([B[:, 3] for B in boards], axis=0))
-    S, focal, ones = _skew(points), lens.focal(), np.broadcast_to(np.eye(2), (len(points), 2, 2))
+    S, focal = _skew(points), lens.focal()
 
     def problem(state: tuple[np.ndarray, np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
         X_EC, X_BT = state
@@ -637,7 +645,7 @@ def _refined_hand_eye(
             if not (P[:, 2] > 1e-6).all():
                 return math.inf, H, g
             at = P[:, :2] / P[:, 2:]
-            D = focal * np.concatenate([ones, -at[:, :, None]], 2) / P[:, 2, None, None]
+            D = focal * _divided(at, P[:, 2])
             dP = np.concatenate(
                 [
                     _skew(P),
@@ -669,6 +677,11 @@ def _skew(v: np.ndarray) -> np.ndarray:
     S = np.zeros((len(v), 3, 3))
     S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     return S - S.transpose(0, 2, 1)
+
+
+def _divided(xy: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """d (x / z, y / z) / d (x, y, z) at x / z, y / z = xy (n, 2) -> (n, 2, 3)."""
+    return np.concatenate([np.broadcast_to(np.eye(2), (len(xy), 2, 2)), -xy[:, :, None]], 2) / z[:, None, None]
 
 
 def _transform(rvec: np.ndarray, tvec: np.ndarray) -> np.ndarray:

@@ -7,7 +7,16 @@ from typing import Any
 import numpy as np
 
 from valve_drake import frames
-from valve_drake.camera.lens import LensModel, OpenCvLens, StereoHead, lens_from, lens_to, load_head, read_yaml, write_yaml
+from valve_drake.camera.lens import (
+    LensModel,
+    OpenCvLens,
+    StereoHead,
+    lens_from,
+    lens_to,
+    load_head,
+    read_yaml,
+    write_yaml,
+)
 from valve_drake.checks import ConfigError, require
 
 _ROS_MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "none": (0,)}
@@ -29,7 +38,7 @@ def load_calibration(paths: Sequence[Path]) -> StereoHead | LensModel:
     return load_head(paths[0])
 
 
-def save_camera(lens: LensModel, path: Path, comment: str, **more: np.ndarray) -> None:
+def save_camera(lens: LensModel, path: Path, comment: str = "", **more: np.ndarray) -> None:
     """Writes one lens as `camera`, and named transforms beside it."""
     write_yaml({"camera": lens_to(lens)} | {name: X.tolist() for name, X in more.items()}, path, comment)
 

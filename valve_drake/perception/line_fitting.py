@@ -32,7 +32,7 @@ _PRIOR_POINTS = 20  # how many points the noise predicted from the grey values c
 
 @dc.dataclass
 class LineFittingConfig:
-    half_window: int = 5  # of a profile [px]; smaller on small quadrilaterals
+    half_window: int = 8  # of a profile [px]; smaller on small quadrilaterals and towards the corners
     trim: float = 2.5  # of a side at each corner, beyond the profile's reach [px]
     gamma: float = 1.0  # light = value^gamma; 1 if pixel values are linear in light, 2.2 for ordinary cameras
     iterations: int = 5
@@ -244,7 +244,9 @@ class _Sides:
     start: np.ndarray  # position across the side at t = 0 ...
     slope: np.ndarray  # ... and its change with t
     inward: np.ndarray  # +-1: the way across the side that leads inside
-    half: int  # of a profile [px]
+    half: int  # of a profile [px] ...
+    spare: np.ndarray  # ... and by how much less it is at a side's ends, where it would meet the next side
+    lean: np.ndarray  # pixels along t that a profile needs for one more pixel of its half
 
 
 def _place(
@@ -266,9 +268,10 @@ def _place(
     cosine = 1 / np.sqrt(1 + slope**2)
     # A profile must reach neither the opposite side nor the rim of the light plate round the marker.
     width = polygon_area(corners) / lengths.max()
-    half = int(max(np.clip(round(0.12 * width), 3, config.half_window), min(least, 0.3 * width)))
-    # The light plate is narrowest at the corners, which only small markers feel.
-    reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 4.0)) + half * np.abs(slope) * cosine
+    half = int(max(np.clip(round(0.18 * width), 3, config.half_window), min(least, 0.3 * width)))
+    # The light plate is narrowest at the corners: profiles are short there, and grow with the distance from them.
+    least_half = min(half, 3)
+    reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 3.0)) + least_half * np.abs(slope) * cosine
     begin = np.minimum(corners[four, t_axis], ends[four, t_axis]) + reach * cosine
     stop = np.maximum(corners[four, t_axis], ends[four, t_axis]) - reach * cosine
     limit = np.where(flat, channel.shape[1], channel.shape[0]) - 1
@@ -278,14 +281,15 @@ def _place(
         return f"side {int(np.argmin(count))} short"
     start = corners[four, 1 - t_axis] - slope * corners[four, t_axis]
     inward = np.sign(corners.mean(0)[1 - t_axis] - (corners + ends)[four, 1 - t_axis] / 2)
-    return _Sides(channel, flat, first, count, start, slope, inward, half)
+    lean = np.maximum(np.abs(slope) * cosine**2, 1.5)
+    return _Sides(channel, flat, first, count, start, slope, inward, half, np.full(4, half - least_half), lean)
 
 
 def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
     """Step 3: the sides of all quadrilaterals together, as arrays (S sides, N profiles, M pixels)."""
-    flat, first, count, start, slope, inward = (
+    flat, first, count, start, slope, inward, spare, lean = (
         np.concatenate([getattr(q, name) for q in quads])
-        for name in ("flat", "first", "count", "start", "slope", "inward")
+        for name in ("flat", "first", "count", "start", "slope", "inward", "spare", "lean")
     )
     half = np.repeat([float(q.half) for q in quads], 4)
     tall, wide = (np.repeat([q.channel.shape[k] for q in quads], 4)[:, None, None] for k in (0, 1))
@@ -297,6 +301,9 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
     t = first[:, None] + k  # (S, N)
     used = (k < count[:, None]).astype(float)
     tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1 along each side
+    from_end = np.minimum(k, count[:, None] - 1 - k)
+    room = half[:, None] - np.maximum(spare[:, None] - from_end / np.maximum(lean, 1e-3)[:, None], 0)
+    room = (np.minimum(room, half[:, None]) + 1).astype(np.float32)[:, :, None]  # (S, N, 1)
     curve = start[:, None] + slope[:, None] * t
     reach = int(half.max()) + 2
     y = np.rint(curve)[:, :, None] + np.arange(-reach, reach + 1)  # (S, N, M)
@@ -314,11 +321,11 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
     for step in range(config.iterations):
         offset = (y - curve[:, :, None]).astype(np.float32)
         # No pixel enters or leaves at once.
-        weight = valid * np.clip((half + 1).astype(np.float32)[:, None, None] - np.abs(offset), 0, 1)
+        weight = valid * np.clip(room - np.abs(offset), 0, 1)
         z = (inward * cosine / blur).astype(np.float32)[:, None, None] * offset
         bell = np.exp(-0.5 * z * z) * np.float32(1 / np.sqrt(2 * np.pi))
         rise = _normal_cdf(z, bell)
-        level = _levels(weight, good, rise, bell, f, tau)
+        level, kept = _levels(weight, good, rise, bell, f, tau)
         has_step &= level[:, 2] >= 0.3
         base = (level[:, 0:1] + level[:, 1:2] * tau).astype(np.float32)
         height = np.maximum(level[:, 2:3] + level[:, 3:4] * tau, 0.05).astype(np.float32)  # (S, N)
@@ -357,6 +364,7 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         sigma = np.sqrt(
             (deviation[own].sum() + _PRIOR_POINTS * predicted[own].sum() / max(n, 1)) / (freedom + _PRIOR_POINTS)
         )
+        sigma *= np.sqrt(np.mean(1 / kept[own]))
         reason = ""
         if not has_step[own].all():
             reason = f"side {int(np.argmin(has_step[own]))} has no step"
@@ -379,11 +387,13 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _levels(
     weight: np.ndarray, good: np.ndarray, rise: np.ndarray, bell: np.ndarray, f: np.ndarray, tau: np.ndarray
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Least squares of f = (b0 + b1 tau) + (a0 + a1 tau) rise + (c0 + c1 tau) bell -> (S, 4): b0, b1, a0, a1.
 
     The bell's share is what a shift and a turn of the side would change. Without it the levels would take part of
     a wrong start for themselves, and the fit would creep.
+    And (S,): the share of what the pixels know of a side's shift that is left, since they must tell its levels as well.
+    All points of a side share the levels' error, so their scatter does not show it.
     """
     risen, belled = weight * rise, weight * bell
     sums = np.stack(
@@ -395,7 +405,10 @@ def _levels(
     r = np.einsum("asn,psn->sap", right, powers[:2]).reshape(-1, 6)
     # A short side shows no trend: hold it near zero there.
     normal = m[:, _PRODUCT, _TAU_POWER] + np.diag([1e-9, 0.1, 1e-9, 0.1, 1e-6, 1e-6])
-    return np.linalg.solve(normal, r[:, :, None])[:, :4, 0]
+    levels, bells = normal[:, :4, :4], normal[:, :4, 4:]
+    taken = (bells * np.linalg.solve(levels, bells)).sum(1)
+    kept = 1 - (taken / normal[:, [4, 5], [4, 5]]).mean(1)
+    return np.linalg.solve(normal, r[:, :, None])[:, :4, 0], np.clip(kept, 0.1, 1.0)
 
 
 def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -45,24 +45,26 @@ def look(
     single = not isinstance(cameras, StereoHead)
     head = StereoHead(cameras, cameras, np.eye(3, 4)) if single else cameras
     lenses = head.lenses()[: len(images)]
-    for image, lens in zip(images, lenses):
-        (height, width), wanted = image.shape[:2], (lens.width, lens.height)
-        if (width, height) != wanted:
-            raise ConfigError(f"image of {width} x {height}, but the calibration is for {wanted[0]} x {wanted[1]}")
+    for name, image, lens in zip(("left", "right"), images, lenses):
+        if image.shape[:2] != (lens.height, lens.width):
+            which, (height, width) = name if len(images) == 2 else "the", image.shape[:2]
+            raise ConfigError(f"{which} image is {width} x {height}, its calibration for {lens.width} x {lens.height}")
     slack = _SLACK * head.rms_px if len(images) == 2 else 0.0  # [px]
     marker = Marker(size=list(size), handle_radius=max(0.15, max(size)))
     coloring = ColorSegmentationConfig(min_fill=0.78)  # blurred colours round the corners off
-    lines = LineFittingConfig(max_sigma=0.6, single_camera=len(images) == 1)
+    lines = LineFittingConfig(max_sigma=1.5, single_camera=len(images) == 1)
     matching = StereoPositioningConfig(epipolar_gate=4.0 + slack, size_gate=0.3)
     fitting = RectangleEstimatorConfig(
-        method=method, yaw_sigma=slack / head.right.focal(), max_residual=1.0, size_gate=0.2, min_distance=0.1
+        method=method, yaw_sigma=slack / head.right.focal(), max_residual=1.2, size_gate=0.2, min_distance=0.1
     )
     for config in (marker, coloring, lines, matching, fitting):
         config.check()
     seen = []
     for name, image in zip(("left", "right"), images):
         candidates, green = segment(image, coloring)
-        seen.append(Segmentation(frame=CameraFrame(camera=name, image=np.array(image)), candidates=candidates, green=green))
+        seen.append(
+            Segmentation(frame=CameraFrame(camera=name, image=np.array(image)), candidates=candidates, green=green)
+        )
     pair = SegmentationPair(left=seen[0], right=seen[1] if len(seen) == 2 else Segmentation())
     edges = fit_pair(pair, head, marker, lines, matching)
     shift = np.zeros(2)
@@ -110,7 +112,8 @@ def _fitted(P: np.ndarray, quad: QuadEdges, lens: LensModel) -> np.ndarray:
     near = np.argmin(np.hypot(off, beyond), axis=1)
     own, n = off[np.arange(len(off)), near], normal[near]
     for _ in range(3):
-        left = own - n @ (shift := np.linalg.lstsq(n, own, rcond=None)[0])
+        shift = np.linalg.lstsq(n, own, rcond=None)[0]
+        left = own - n @ shift
         keep = np.abs(left) <= 4 * np.median(np.abs(left)) + 1e-12
         own, n = own[keep], n[keep]
     return lens.project(corners + shift)

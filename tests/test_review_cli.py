@@ -1,0 +1,238 @@
+"""`valve-drake review` from the outside: pages, JSON, tables, exit codes, and one line for whatever cannot be read."""
+
+import csv
+import io
+import json
+import sqlite3
+
+import numpy as np
+import pytest
+import review_samples as sample
+
+from valve_drake import cli
+from valve_drake.analysis import export
+from valve_drake.messages import CameraFrame, Command, HandleMark, HandleMarks, Status
+from valve_drake.recording import foxglove
+from valve_drake.recording.reader import LogReader, recover
+from valve_drake.recording.writer import LogWriter
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    return sample.write_run(tmp_path_factory.mktemp("source") / "run.mcap").read_bytes()
+
+
+@pytest.fixture
+def log(source, tmp_path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(source)
+    return path
+
+
+@pytest.fixture
+def hurt(source, tmp_path):
+    data = bytearray(source)
+    data[len(data) // 2] ^= 0xFF
+    path = tmp_path / "hurt.mcap"
+    path.write_bytes(data)
+    return path
+
+
+def review(capsys, *arguments):
+    code = cli.main(["review", *map(str, arguments)])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_a_log_gets_its_page_beside_it_and_a_short_word_on_the_terminal(log, capsys):
+    code, out, err = review(capsys, log)
+    page = log.with_name("run.review.html")
+    assert code == 0 and err == "" and page.read_text(encoding="utf-8").startswith("<!doctype html>")
+    assert "verdict turned" in out and "the log is whole" in out and str(page) in out
+    assert "servo (retry 1)" in out
+
+
+def test_html_says_where_the_page_goes_and_links_are_right_from_there(log, capsys, tmp_path):
+    log.with_suffix(".html").write_text("3D", encoding="utf-8")
+    (tmp_path / "pages").mkdir()
+    assert review(capsys, log, "--html", tmp_path / "pages" / "a.html")[0] == 0
+    assert 'href="../run.html"' in (tmp_path / "pages" / "a.html").read_text(encoding="utf-8")
+    assert not log.with_name("run.review.html").exists()
+
+
+def test_json_prints_one_object_and_writes_no_page(log, capsys):
+    code, out, _ = review(capsys, log, "--json")
+    facts = json.loads(out)
+    assert code == 0 and facts["outcome"] == "done" and facts["html"] is None and facts["sound"]
+    assert not log.with_name("run.review.html").exists()
+
+
+def test_a_damaged_log_is_read_by_itself_and_the_exit_code_is_3(hurt, capsys):
+    code, out, _ = review(capsys, hurt)
+    assert code == 3 and "damaged: " in out and "not whole" in out
+    assert "bytes are damaged after t" in hurt.with_name("hurt.review.html").read_text(encoding="utf-8")
+
+
+def test_a_log_that_was_cut_off_is_read_too(source, capsys, tmp_path):
+    path = tmp_path / "cut.mcap.active"
+    path.write_bytes(source[: len(source) // 2])
+    code, out, _ = review(capsys, path, "--json")
+    facts = json.loads(out)
+    assert code == 3 and not facts["finished"] and facts["outcome"] == "unfinished"
+    assert any("breaks off" in line for line in facts["damage"])
+
+
+def test_a_recovered_log_still_says_what_is_missing(hurt, capsys, tmp_path):
+    recover(hurt, tmp_path / "again.mcap")
+    code, out, _ = review(capsys, tmp_path / "again.mcap", "--json")
+    assert code == 3 and any("recovered from a damaged log" in line for line in json.loads(out)["damage"])
+
+
+def test_two_logs_are_compared(log, capsys, tmp_path):
+    other = sample.write_run(tmp_path / "other.mcap", scenario=sample.SCENARIO.replace("seed: 7", "seed: 8"))
+    code, out, _ = review(capsys, log, other)
+    assert code == 0 and "identical" in out
+    page = tmp_path / "run-other.review.html"
+    assert "Two runs compared" in page.read_text(encoding="utf-8")
+    facts = json.loads(review(capsys, log, other, "--json")[1])
+    assert facts["identical"] and facts["settings"] == {"seed": {"a": 7, "b": 8}}
+
+
+def test_where_two_logs_part_is_printed(log, capsys, tmp_path):
+    def change(topic, message, t):
+        return Status(time=t, detail="other") if topic == "/base_approach/status" and t >= 1.0 else message
+
+    other = sample.write_run(tmp_path / "other.mcap", change=change)
+    _, out, _ = review(capsys, log, other)
+    assert "they part at t = 1.000000 s, /base_approach/status detail:  and other" in out
+
+
+def test_comparing_with_a_damaged_log_ends_with_3(log, hurt, capsys):
+    assert review(capsys, log, hurt)[0] == 3
+
+
+# ---------------------------------------------------------------- export
+
+
+def table(path):
+    rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
+    return rows[0], rows[1:]
+
+
+def test_export_csv_has_time_in_ns_and_every_value_to_the_bit(log, capsys, tmp_path):
+    code, out, _ = review(
+        capsys, log, "--export", "csv", "--topic", "/rectangle_estimator/estimate", "--out", tmp_path / "e.csv"
+    )
+    head, rows = table(tmp_path / "e.csv")
+    messages = list(LogReader(log).messages(["/rectangle_estimator/estimate"]))
+    assert code == 0 and str(len(messages)) in out and len(rows) == len(messages)
+    assert head[:2] == ["time_ns", "time"] and "X_LV[11]" in head and "covariance[35]" in head
+    assert int(rows[0][0]) == round(messages[0][1] * 1e9)
+    values = [float(rows[3][head.index(f"X_LV[{k}]")]) for k in range(12)]
+    assert values == messages[3][2].X_LV.ravel().tolist()
+
+
+def test_export_goes_beside_the_log_by_default_and_names_joints(log, capsys, tmp_path):
+    assert review(capsys, log, "--export", "csv", "--topic", "/joint_states")[0] == 0
+    head, rows = table(tmp_path / "run.joint_states.csv")
+    assert "joints[left_arm_1].position" in head and len(rows) == 768
+    assert float(rows[0][head.index("joints[waist].position")]) == 0.1
+
+
+def test_export_npz_gives_arrays_by_field(log, capsys, tmp_path):
+    path = tmp_path / "t.npz"
+    assert review(capsys, log, "--export", "npz", "--topic", "/hybrid_rotation/turn", "--out", path)[0] == 0
+    with np.load(path) as found:
+        assert found["time_ns"].dtype == np.int64 and found["time"][0] == 3.0
+        assert found["force_left"].shape == (256, 3) and set(found["stage"]) == {"grasp", "turn", "release"}
+        assert found["angle"][-1] == sample.valve_angle(5.0)
+
+
+def test_every_topic_can_be_exported_in_both_forms(log, tmp_path):
+    reader = LogReader(log)
+    for topic in reader.topics:
+        for form in export.FORMATS:
+            assert export.write(reader, topic, form, tmp_path / f"x.{form}") == reader.topics[topic].count
+        with np.load(tmp_path / "x.npz") as found:
+            assert all(len(found[name]) == reader.topics[topic].count for name in found)
+
+
+def test_export_of_changing_lengths_absent_groups_truth_and_nested_messages(tmp_path):
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        writer.write("/c", Command(time=0.0), 0.0)
+        writer.write("/c", Command(time=1.0, torso=[1, 2, 3]), 1.0)
+        mark = HandleMark(found=True, frame=CameraFrame("left_wrist", 0.5, 3), corners=[[1, 2], [3, 4]])
+        writer.write("/m", HandleMarks(time=1.0, left=mark), 1.0)
+        writer.write("/i", foxglove.image(CameraFrame("x", 0.25, 0, data=b"12345")), 1.0)
+    reader = LogReader(tmp_path / "a.mcap")
+    export.write(reader, "/c", "csv", tmp_path / "c.csv")
+    head, rows = table(tmp_path / "c.csv")
+    assert [row[head.index("torso[2]")] for row in rows] == ["", "3.0"]  # not asked for at first
+    export.write(reader, "/m", "npz", tmp_path / "m.npz")
+    with np.load(tmp_path / "m.npz") as found:
+        assert found["left.corners"].tolist() == [[[1.0, 2.0], [3.0, 4.0]]]
+        assert found["left.frame.sequence"].tolist() == [3]
+    export.write(reader, "/i", "csv", tmp_path / "i.csv")
+    head, rows = table(tmp_path / "i.csv")
+    assert rows[0][head.index("timestamp")] == "0.25" and rows[0][head.index("data.bytes")] == "5"
+
+
+def test_export_of_truth_uses_its_names(log, capsys, tmp_path):
+    assert review(capsys, log, "--export", "csv", "--topic", "/truth/base_pose", "--out", tmp_path / "b.csv")[0] == 0
+    assert table(tmp_path / "b.csv")[0] == ["time_ns", "time", "message_time", "x", "y", "heading"]
+
+
+def test_export_from_a_damaged_log_gives_what_there_is_and_3(hurt, capsys, tmp_path):
+    code, out, _ = review(capsys, hurt, "--export", "csv", "--topic", "/joint_states", "--out", tmp_path / "j.csv")
+    assert code == 3 and "damaged" in out and 0 < len(table(tmp_path / "j.csv")[1]) < 768
+
+
+# ---------------------------------------------------------------- bad input
+
+
+def a_ros_2_bag(path):
+    with sqlite3.connect(path) as base:
+        base.execute("create table messages (id)")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: None, "there is no log"),
+        (lambda path: path.write_bytes(b""), "is empty"),
+        (lambda path: path.write_text("hello, this is a text file of some length\n" * 5), "not an MCAP log"),
+        (lambda path: path.write_bytes(b"#ROSBAG V2.0\n" + b"x" * 100), "ROS 1 bag"),
+        (a_ros_2_bag, "ROS 2 bag"),
+        (lambda path: path.mkdir(), "cannot be read"),
+    ],
+)
+def test_what_is_no_log_is_one_line_and_2(make, words, tmp_path, capsys):
+    path = tmp_path / "odd.mcap"
+    make(path)
+    code, out, err = review(capsys, path)
+    assert code == 2 and out == "" and err.count("\n") == 1 and words in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["LOG", "LOG", "LOG"], "one log or two"),
+        (["LOG", "--export", "csv"], "--topic"),
+        (["LOG", "--topic", "/health"], "--export"),
+        (["LOG", "LOG", "--export", "csv", "--topic", "/health"], "one log"),
+        (["LOG", "--export", "csv", "--topic", "/nothing"], "no topic /nothing"),
+        (["LOG", "--export", "xml", "--topic", "/health"], "xml"),
+        (["LOG", "--html", "LOG"], "another file"),
+        (["LOG", "--export", "csv", "--topic", "/health", "--out", "LOG"], "another file"),
+        (["LOG", "--html", "nowhere/at/all.html"], "cannot be written"),
+        (["LOG", "--export", "npz", "--topic", "/health", "--out", "nowhere/at/all.npz"], "cannot be written"),
+        ([], "LOG"),
+    ],
+)
+def test_a_wrong_request_is_one_line_and_2_and_the_log_stays_as_it_is(
+    arguments, words, log, source, capsys, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = review(capsys, *(log if word == "LOG" else word for word in arguments))
+    assert code == 2 and err.count("\n") == 1 and err.startswith("valve-drake: ") and words in err
+    assert log.read_bytes() == source
