@@ -537,6 +537,17 @@ def test_a_moving_hand_is_not_tared_and_a_new_stand_still_starts_anew():
     assert bench.memory.bias == pytest.approx(bench.bias)
 
 
+def test_a_sensor_that_reports_nonsense_is_not_tared():
+    bench = Bench(seed=5, noise=0.0)
+    bench.run(Mode.REACH, limit=0.1)
+    good, bench.bias = bench.bias, bench.bias * np.nan
+    bench.run(Mode.REACH, limit=0.1)
+    assert bench.memory.bias == pytest.approx(good)
+    bench.bias = good + 0.5
+    bench.run(Mode.REACH, limit=0.1)
+    assert bench.memory.bias == pytest.approx(good + 0.5)
+
+
 # ---------------------------------------------------------------- the equations
 
 
@@ -554,6 +565,8 @@ def test_the_chain_by_hand():
     assert chain.couples == pytest.approx([2.55, 2.55])
     assert chain.torque == pytest.approx(5.1)
     assert chain_with(m1=(0.4, 0, 0)).torque == pytest.approx(0.4)  # by the wrist alone
+    deeper = make_chain(np.array([[0.64, 0.15, 0.0], [0.6, -0.15, 0.0]]), np.zeros((2, 6)), np.array([-1.0, 0, 0]))
+    assert deeper.b.tolist() == [0, -1, 0] and deeper.L == pytest.approx(0.3)  # across the axis
 
 
 def test_a_load_on_one_hand_moves_that_hand_alone():
@@ -598,7 +611,7 @@ def test_the_rate_ramps_brakes_and_is_scaled_by_torque_and_lead():
     assert rate() == full
     assert rate(now=0.0) == pytest.approx(full / CONFIG.ramp * TICK)
     assert rate(now=-0.2) == rate(now=0.0)
-    assert CONFIG.slow <= rate(left=1e-4) < rate(left=0.01) < full
+    assert rate(left=1e-6) == CONFIG.slow < rate(left=1e-3) < rate(left=0.01) < full
     assert rate(left=0.0) == 0.0 and rate(left=-0.1) == 0.0
     assert rate(torque=0.7 * CONFIG.torque_limit) == pytest.approx(full)
     assert rate(torque=0.85 * CONFIG.torque_limit) == pytest.approx(full / 2)

@@ -72,6 +72,14 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, metavar="FILE", help="of the export (default: beside the log)")
     p.set_defaults(command=_review)
 
+    p = commands.add_parser("experiment", help="the paper's tables, the bound and robustness, done again on drawn images")
+    p.add_argument("name", choices=("table2", "table3", "bound", "robustness"))
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--trials", type=int, metavar="N", help="images per row (table2: runs of six poses; bound: per cell)")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.add_argument("--out", type=Path, metavar="DIR", help="write NAME.json there, and the plot of the bound")
+    p.set_defaults(command=_experiment)
+
     p = commands.add_parser("replay", help="the same blocks on what a log holds: is all as it was recorded?")
     p.add_argument("log", type=Path)
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="another value, on the old data")
@@ -87,7 +95,9 @@ def _parser() -> argparse.ArgumentParser:
     p = commands.add_parser("estimate", help="the pose of a red rectangle in one photograph, or a stereo pair")
     p.add_argument("left", type=Path, metavar="LEFT")
     p.add_argument("right", type=Path, metavar="RIGHT", nargs="?")
-    p.add_argument("--calibration", type=Path, required=True, nargs="+", metavar="FILE", help="ROS pairs: two files")
+    p.add_argument(
+        "--calibration", type=Path, required=True, action="append", metavar="FILE", help="twice for a ROS stereo pair"
+    )
     p.add_argument("--marker", required=True, metavar="98x100", help="width and height of the rectangle [mm]")
     p.add_argument("--method", choices=("refined", "paper"), default="refined")
     p.add_argument("--camera", choices=("left", "right"), default="left", help="of a head, that a single image is from")
@@ -353,6 +363,45 @@ def _export(options: argparse.Namespace) -> int:
         for line in log.damage:
             print(f"  {line}")
     return DAMAGED if log.damage else OK
+
+
+# ---------------------------------------------------------------- experiment
+
+
+def _experiment(options: argparse.Namespace) -> int:
+    from valve_drake.analysis import experiments
+
+    if options.out and not options.out.is_dir():
+        raise ConfigError(f"--out must be a folder, got {options.out}")
+    result = experiments.run(options.name, options.seed, options.trials)
+    if options.out:
+        (options.out / f"{options.name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        if options.name == "bound":
+            experiments.plot_bound(result, options.out / "estimator_bound.svg")
+    if options.json:
+        print(json.dumps(result))
+    else:
+        _print_experiment(result)
+    return OK
+
+
+def _print_experiment(result: dict) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    def shown(value: object) -> str:
+        return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+    console = Console(highlight=False, soft_wrap=True)
+    console.width = max(console.width, 140)  # of the table, also in a pipe
+    columns = list(dict.fromkeys(key for row in result["rows"] for key in row))
+    table = Table(*columns, box=None, header_style="dim")
+    for row in result["rows"]:
+        table.add_row(*(shown(row.get(key)) for key in columns))
+    console.print(f"{result['experiment']}: {result['settings']}", markup=False)
+    console.print(table)
+    for name, value in result.get("totals", {}).items():
+        console.print(f"{name}: {value}", markup=False)
 
 
 # ---------------------------------------------------------------- replay

@@ -8,6 +8,7 @@ pixel and shifts whole sides by 0.02 px, ten times what the estimator can tell; 
 
 import functools
 import math
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ RED, GREEN, PLATE, WALL, METAL = (190, 30, 28), (20, 140, 45), (190, 190, 186), 
 _ERF = np.frompyfunc(math.erf, 1, 1)
 _NEAR = 0.05  # shapes nearer to the camera than this are not drawn [m]
 _STEP = 1 / 128  # of the tables below [px]
+_UNIT = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
 
 
 @functools.lru_cache(maxsize=8)
@@ -63,27 +65,39 @@ class Canvas:
         self, X_CS: np.ndarray, half: tuple[float, float], box: tuple[slice, slice] | None = None
     ) -> tuple[np.ndarray, tuple[slice, slice]] | None:
         """How much of each pixel (0..1) within `box` a rectangle covers; None if it is out of sight."""
-        P = frames.apply(X_CS, np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0])
+        P = frames.apply(X_CS, _UNIT * [*half, 0])
         box = box or self._box(P)
         if box is None or (P[:, 2] < _NEAR).any():
             return None
+        out = np.ones(self._xy[box].shape[:2])
+        for d, n_u in self._distances(P, box):
+            out *= np.interp(d, *_profile(n_u, self.blur))
+        return out, box
+
+    def off_corners(
+        self, X_CS: np.ndarray, half: tuple[float, float], box: tuple[slice, slice], margin: float
+    ) -> np.ndarray:
+        """Which pixels within `box` lie more than `margin` [px] inside of three sides of a rectangle, or of all four."""
+        distances = [d for d, _ in self._distances(frames.apply(X_CS, _UNIT * [*half, 0]), box)]
+        return np.sort(distances, axis=0)[1] > margin
+
+    def _distances(self, P: np.ndarray, box: tuple[slice, slice]) -> Iterator[tuple[np.ndarray, float]]:
+        """For each side of P (4, 3): the pixels' distance inside of it [px], and its normal's u at its middle."""
         xy, A = self._xy[box], self._jacobian[box]
         q = P / P[:, 2:]
         turn = np.sign(np.cross(q[1] - q[0], q[2] - q[1])[2])
-        out = np.ones(xy.shape[:2])
         for i, j in enumerate(NEXT):
             line = np.cross(q[i], q[j]) * turn
-            # The edge is straight over a pixel's width: the lens bends it over the whole image only.
+            g_u = line[0] * A[..., 0, 0] + line[1] * A[..., 1, 0]
+            g_v = line[0] * A[..., 0, 1] + line[1] * A[..., 1, 1]
+            slope = np.hypot(g_u, g_v)
+            # The lens turns the edge over the whole image only: one normal does for a side.
             near = np.abs(xy - (q[i, :2] + q[j, :2]) / 2).sum(-1).argmin()
-            gradient = line[:2] @ A.reshape(-1, 2, 2)[near]
-            slope = np.hypot(line[0] * A[..., 0, 0] + line[1] * A[..., 1, 0], line[0] * A[..., 0, 1] + line[1] * A[..., 1, 1])
-            d = (xy @ line[:2] + line[2]) / slope
-            out *= np.interp(d, *_profile(round(float(gradient[0] / np.linalg.norm(gradient)), 4), self.blur))
-        return out, box
+            yield (xy @ line[:2] + line[2]) / slope, round(float(g_u.flat[near] / slope.flat[near]), 4)
 
     def disc(self, X_CS: np.ndarray, color: tuple, half: tuple[float, float]) -> None:
         """An ellipse; its edge is nobody's measure, so the pixel's square counts as a little more blur."""
-        P = frames.apply(X_CS, np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0])
+        P = frames.apply(X_CS, _UNIT * [*half, 0])
         box = self._box(P)
         if box is None or (P[:, 2] < _NEAR).any() or min(box[0].stop - box[0].start, box[1].stop - box[1].start) < 2:
             return

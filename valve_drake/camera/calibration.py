@@ -216,7 +216,9 @@ def _minimize(problem: Callable, state: Any, moved: Callable, steps: int = 200) 
     """Levenberg-Marquardt from `state` until no step is expected to matter -> the best state, problem(state)."""
     at = problem(state)
     if not math.isfinite(at[0]):
-        raise ConfigError("the calibration has no start: do all images show the same board, and the poses belong to them?")
+        raise ConfigError(
+            "the calibration has no start: do the images, and the poses, belong together?"
+        )
     damping = 1e-4
     for _ in range(steps):
         cost, H, g = at[:3]
@@ -368,8 +370,8 @@ def _refuse_frontal(normals: Sequence[np.ndarray]) -> None:
     if min(tilt, between) < _MIN_TILT:
         how = "faces the camera" if tilt < _MIN_TILT else "lies the same way"
         raise ConfigError(
-            f"degenerate: the board {how} in every image (within {min(tilt, between):.0f} deg), so that its distance and "
-            f"the focal length cannot be told apart: {_TILT}"
+            f"degenerate: the board {how} in every image (within {min(tilt, between):.0f} deg), so that its "
+            f"distance and the focal length cannot be told apart: {_TILT}"
         )
 
 

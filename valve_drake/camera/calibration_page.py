@@ -50,7 +50,8 @@ def cameras(numbers: dict[str, Any], result: Calibration, size: tuple[int, int])
     lenses = numbers["lenses"].items()
     rows = [(k + " (better)" * (k == result.better), f"{v['rms_px']:.3f}", v["parameters"]) for k, v in lenses]
     parts += ["<h2>Lens models on the same corners</h2>", _table(("model", "rms [px]", "parameters"), rows)]
-    rows = [(name, f"{value:.6g}", f"{sigmas[name]:.2g}") for name, value in numbers["parameters"].items()]
+    lens = [(name, value) for name, value in numbers["parameters"].items() if not name.startswith("X_LR")]
+    rows = [(name, f"{value:.6g}", f"{sigmas[name]:.2g}") for name, value in lens]
     if both:
         rotation, spread = np.degrees(frames.rotation_vector(fit.X_LR[:, :3])), numbers["X_LR_sigma"]
         for k, axis in enumerate("xyz"):
@@ -86,7 +87,7 @@ def hand_eye(numbers: dict[str, Any], corners: Sequence[np.ndarray], size: tuple
     parts = [_head(title, told, numbers["warnings"], figures)]
     rows = [[f"{value:.6f}" for value in row] for row in numbers["X_EC"]]
     parts += [f"<h2>{key}</h2>", _table(("x", "y", "z", "position [m]"), rows)]
-    spread = numbers["standard_deviations"]
+    spread = numbers["X_EC_sigma"]
     rows = [(a, f"{d:.3g}", f"{p:.3g}") for a, d, p in zip("xyz", spread["rotation_deg"], spread["position_mm"])]
     parts += ["<h2>Standard deviations</h2>", "<p class='note'>By leaving out one view at a time.</p>"]
     parts += [_table(("axis", "rotation [deg]", "position [mm]"), rows), "<h2>Views</h2>"]

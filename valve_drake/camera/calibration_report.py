@@ -33,7 +33,7 @@ class Report:
             out.append(f"the views disagree by {n['residual_deg']:.3f} deg, {n['residual_mm']:.2f} mm rms")
         else:
             sigmas = n["standard_deviations"]
-            out += [f"  {name:<9} {value:12.6g} +- {sigmas[name]:.2g}" for name, value in n["parameters"].items()]
+            out += [f"  {name:<13} {value:12.6g} +- {sigmas[name]:.2g}" for name, value in n["parameters"].items()]
             lenses = ", ".join(f"{k} lens {v['rms_px']:.3f} px" for k, v in n["lenses"].items())
             out.append(f"{lenses}; better: {n['better_lens']}")
         if n["command"] == "stereo":
@@ -112,7 +112,9 @@ def hand_eye(
         "residual_mm": _rms(result.position_mm),
         "left_out_deg": _rms(result.left_out_deg),
         "left_out_mm": _rms(result.left_out_mm),
-        "standard_deviations": {"rotation_deg": result.sigma_deg.tolist(), "position_mm": result.sigma_mm.tolist()},
+        "parameters": _named(frames.rotation_vector(result.X[:, :3]), result.X[:, 3]),
+        "standard_deviations": _named(np.radians(result.sigma_deg), result.sigma_mm / 1e3),
+        "X_EC_sigma": {"rotation_deg": result.sigma_deg.tolist(), "position_mm": result.sigma_mm.tolist()},
         "per_view": [
             {
                 "image": names[k],
@@ -191,6 +193,9 @@ def _read_poses(path: Path) -> dict[str, np.ndarray]:
 def _report(command: str, result: cal.Calibration, pictures: _Pictures, board: Board, out: Path) -> Report:
     fit, both = result.fit, len(result.fit.lenses) == 2
     values, sigmas, outliers = cal.parameters(fit), fit.sigmas(), fit.outliers()
+    if both:
+        pose = _named(frames.rotation_vector(fit.X_LR[:, :3]), fit.X_LR[:, 3])
+        values |= {f"X_LR.{name}": value for name, value in pose.items()}
     rms = fit.view_rms()
     tilts = np.degrees(cal.tilts(fit))
     per_view = []
@@ -208,8 +213,8 @@ def _report(command: str, result: cal.Calibration, pictures: _Pictures, board: B
         "lens": fit.kind,
         "rms_px": fit.rms,
         "image_size": list(pictures.size),
-        "parameters": {name: value for name, value in values.items() if name in sigmas},
-        "standard_deviations": {name: value for name, value in sigmas.items() if name in values},
+        "parameters": {name: values[name] for name in sigmas},
+        "standard_deviations": sigmas,
         "lenses": {one.kind: {"rms_px": one.rms, "parameters": len(one.names)} for one in (fit, result.other)},
         "better_lens": result.better,
         "coverage": [_coverage(c, result.views, pictures.size) for c in range(len(fit.lenses))],
@@ -247,6 +252,12 @@ def _report(command: str, result: cal.Calibration, pictures: _Pictures, board: B
         warnings.append(f"no board found in {', '.join(pictures.missed())}")
     numbers["warnings"] = warnings
     return Report(_finite(numbers), pages.cameras(numbers, result, pictures.size))
+
+
+def _named(theta: np.ndarray, p: np.ndarray) -> dict[str, float]:
+    """A transform's rotation vector [rad] and position [m] by name."""
+    names = [f"{what}_{axis}" for what in ("theta", "p") for axis in "xyz"]
+    return dict(zip(names, [*theta.tolist(), *p.tolist()]))
 
 
 def _coverage(camera: int, views: Sequence[cal.View], size: tuple[int, int]) -> float:

@@ -268,7 +268,7 @@ def _place(
     cosine = 1 / np.sqrt(1 + slope**2)
     # A profile must reach neither the opposite side nor the rim of the light plate round the marker.
     width = polygon_area(corners) / lengths.max()
-    half = int(max(np.clip(round(0.18 * width), 3, config.half_window), min(least, 0.3 * width)))
+    half = int(max(np.clip(round(0.12 * width), 3, config.half_window), min(least, 0.3 * width)))
     # The light plate is narrowest at the corners: profiles are short there, and grow with the distance from them.
     least_half = min(half, 3)
     reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 3.0)) + least_half * np.abs(slope) * cosine
