@@ -167,15 +167,14 @@ def every_fourth(t):
         "/health",
         Health(time=t, devices=("base", "head_left"), ages=ages, faults=("base: late",) if t == 4.0 else ()),
     )
-    before = max(t - TICK, 0.0)  # the truth block holds its outputs for a tick, and has none at 0
     values = {
-        "truth.valve_angle": [0.3 + valve_angle(before), 0.0],
-        "truth.base_pose": base(before),
-        "truth.marker_pose": X_WV(before).ravel(),
+        "truth.valve_angle": [0.3 + valve_angle(t), 0.0],
+        "truth.base_pose": base(t),
+        "truth.marker_pose": X_WV(t).ravel(),
         "truth.stem_wrench": np.zeros(6),
     }
     for port, names in TRUTH.items():
-        yield "/" + port.replace(".", "/"), Vector(t, names, np.array(values[port]) * (t > 0))
+        yield "/" + port.replace(".", "/"), Vector(t, names, np.array(values[port]))
 
 
 def messages(end=END):

@@ -569,6 +569,15 @@ def test_the_chain_by_hand():
     assert deeper.b.tolist() == [0, -1, 0] and deeper.L == pytest.approx(0.3)  # across the axis
 
 
+def test_the_turned_angle_is_counted_beyond_half_a_turn():
+    law, u = Bench().law, np.array([-1.0, 0, 0])
+    memory = Memory(b0=np.array([0, -1.0, 0]))
+    for angle in np.linspace(0, -7.0, 40):
+        p = np.array([[0.6, 0.15, 0], [0.6, -0.15, 0]]) @ rotation(angle * u).T
+        memory = law._angle(memory, make_chain(p, np.zeros((2, 6)), u))
+        assert memory.turned == pytest.approx(angle)
+
+
 def test_a_load_on_one_hand_moves_that_hand_alone():
     """Equal to an admittance of D on each hand, as D_a = 2 D and D_r = D / 2 promise."""
     chain = chain_with(f1=(0, 10, 0))

@@ -51,8 +51,8 @@ def test_angles_by_camera_hands_and_truth(summary):
     assert summary.angle_true_rad == pytest.approx(sample.ANGLE, abs=1e-12)
 
 
-def test_truth_is_taken_from_the_first_word_of_its_block_and_not_from_the_empty_message_at_zero(traces):
-    assert traces.truth.time[0] == pytest.approx(1 / 32 - sample.TICK)
+def test_truth_counts_from_the_start_and_stands_at_its_own_time(traces):
+    assert traces.truth.time[0] == 0.0
     assert traces.truth.angle[0] == 0.0
     assert np.allclose(traces.truth.base[0], sample.base(traces.truth.time[0]), atol=1e-12)
 

@@ -10,7 +10,7 @@ from helpers import Rig, assert_clones_are_independent, assert_holds_between_upd
 from valve_drake.behaviors.valve_search import Memory, ValveSearchConfig, aim, step
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.checks import ConfigError
-from valve_drake.frames import apply, inverse, make, wrap
+from valve_drake.frames import apply, inverse, make
 from valve_drake.kinematics import RobotGeometry
 from valve_drake.messages import Mode, ModeState, RectangleEstimate, RobotState, StereoPosition, Verdict
 from valve_drake.ports import TICK

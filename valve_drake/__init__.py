@@ -7,7 +7,7 @@ the paper is a LeafSystem; together they are one Drake diagram:
                                         \\-> stereo_positioning -> valve_search, base_approach
                    -> handle_marker (wrist cameras) -> kinematic_approach, image_servo
     station.joints, wrenches -> robot_state -> all behaviours
-    all behaviours -> (command, status) -> command_selector -> station;  statuses, health, operator -> supervisor -> mode
+    all behaviours -> (command, status) -> command_selector -> station; statuses, health, operator -> supervisor -> mode
 
     valve-drake run                 # the whole work; its log and 3D recording go to logs/
 

@@ -72,10 +72,10 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, metavar="FILE", help="of the export (default: beside the log)")
     p.set_defaults(command=_review)
 
-    p = commands.add_parser("experiment", help="the paper's tables, the bound and robustness, done again on drawn images")
+    p = commands.add_parser("experiment", help="the paper's tables, the bound, robustness, on drawn images")
     p.add_argument("name", choices=("table2", "table3", "bound", "robustness"))
     p.add_argument("--seed", type=int, default=0)
-    p.add_argument("--trials", type=int, metavar="N", help="images per row (table2: runs of six poses; bound: per cell)")
+    p.add_argument("--trials", type=int, metavar="N", help="images a row (table2: runs of six poses)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.add_argument("--out", type=Path, metavar="DIR", help="write NAME.json there, and the plot of the bound")
     p.set_defaults(command=_experiment)

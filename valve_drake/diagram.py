@@ -137,7 +137,7 @@ def make_blocks(scenario: Scenario) -> list:
     marker = scenario.marker
     view = {side: taught[side].view for side in SIDES}
     area = {side: taught[side].area for side in SIDES}
-    X_LMiddle = make(np.eye(3), head.X_LR[:, 3] / 2)  # the gaze is that of both eyes, or near things leave one of them
+    X_LEyes = make(np.eye(3), head.X_LR[:, 3] / 2)  # the gaze is that of both eyes, or near things leave one of them
     collision = CollisionModel(marker, opening=scenario.kinematic_approach.opening)
     return [
         RobotStateSystem(),
@@ -146,7 +146,7 @@ def make_blocks(scenario: Scenario) -> list:
         StereoPositioningSystem(scenario.stereo_positioning, head, GEOMETRY.head_pose, marker),
         RectangleEstimatorSystem(scenario.rectangle_estimator, head, GEOMETRY.head_pose, marker),
         HandleMarkerSystem(scenario.handle_marker),
-        ValveSearchSystem(scenario.valve_search, lambda base, torso: compose(GEOMETRY.head_pose(base, torso), X_LMiddle)),
+        ValveSearchSystem(scenario.valve_search, lambda base, torso: compose(GEOMETRY.head_pose(base, torso), X_LEyes)),
         BaseApproachSystem(scenario.base_approach),
         KinematicApproachSystem(
             KinematicApproach(

@@ -100,9 +100,8 @@ def versions() -> dict[str, str]:
             out[name] = "unknown"
     try:
         here = Path(__file__).resolve().parent
-        git = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=40"], cwd=here, capture_output=True, text=True, timeout=5
-        )
+        describe = ["git", "describe", "--always", "--dirty", "--abbrev=40"]
+        git = subprocess.run(describe, cwd=here, capture_output=True, text=True, timeout=5)
         out["commit"] = git.stdout.strip() if git.returncode == 0 else "unknown"
     except (OSError, subprocess.SubprocessError):
         out["commit"] = "unknown"

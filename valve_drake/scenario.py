@@ -1,8 +1,8 @@
 """The scenario: one typed field for every block, and the world around it. Load, check, override, sample, save.
 
-A scenario file is YAML with this file's names; what it leaves out has its default. Numbers of the simulated world may be
-distributions (`!Uniform {min: 0.81, max: 1.22}`): `resolve` draws them from the seed, each from a stream of its own
-name, so that a new key changes no other number.
+A scenario file is YAML with this file's names; what it leaves out has its default. Numbers of the simulated world
+may be distributions (`!Uniform {min: 0.81, max: 1.22}`): `resolve` draws them from the seed, each from a stream of its
+own name, so that a new key changes no other number.
 """
 
 import dataclasses as dc

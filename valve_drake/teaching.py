@@ -91,7 +91,7 @@ def write(scenario: Scenario, folder: Path) -> None:
         taught,
         folder / "hands.yaml",
         "Made by `valve-drake teach`. For each hand at its handle, gripper open: feature (u, v, 1)/sqrt(area),\n"
-        "image Jacobian d feature / d hand translation [1/m] in the hand's frame, area [px^2], corners [px] of the mark.",
+        "image Jacobian d feature / d hand translation [1/m] in its frame, the mark's area [px^2] and corners [px].",
     )
     for side, picture in pictures.items():
         cv2.imwrite(str(folder / f"{side}.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

@@ -1,6 +1,6 @@
 """Images drawn from geometry, exact to a thousandth of a pixel: what the experiments on the estimator look at.
 
-Every pixel is the integral of a scene of flat shapes, blurred by the lens, over the pixel's own square. Along a straight
+Every pixel is the integral of a scene of flat shapes, blurred by the lens, over the pixel's square. Along a straight
 edge at the signed distance d that integral has a closed form: the step, convolved with a Gaussian and with the two
 boxes that a square is to an edge of normal (n_u, n_v). A renderer's anti-aliasing counts a few samples in each
 pixel and shifts whole sides by 0.02 px, ten times what the estimator can tell; nothing here is sampled.
@@ -77,7 +77,7 @@ class Canvas:
     def off_corners(
         self, X_CS: np.ndarray, half: tuple[float, float], box: tuple[slice, slice], margin: float
     ) -> np.ndarray:
-        """Which pixels within `box` lie more than `margin` [px] inside of three sides of a rectangle, or of all four."""
+        """Which pixels within `box` lie more than `margin` [px] inside of three sides of a rectangle, or of four."""
         distances = [d for d, _ in self._distances(frames.apply(X_CS, _UNIT * [*half, 0]), box)]
         return np.sort(distances, axis=0)[1] > margin
 

@@ -1,9 +1,7 @@
 """From a log to time series: what the numbers (metrics.py) and the plots (report.py) are made of.
 
-Truth: what the simulation records at t is what was so one tick before (its block holds its outputs for a tick), and
-what it records at 0 is nothing yet; both are set right here. The true pose of the marker in the left head camera goes
-through the true base and marker, the measured torso and the *nominal* head: an error of the head's mount counts as an
-error of the estimate.
+Truth: the true pose of the marker in the left head camera goes through the true base and marker, the measured torso
+and the *nominal* head: an error of the head's mount counts as an error of the estimate.
 """
 
 import dataclasses as dc
@@ -16,7 +14,6 @@ from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, inverse, make, planar, rot_z, rotation_vector, wrap
 from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import SIDES, Mode
-from valve_drake.ports import TICK
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.signals import TORSO
 
@@ -172,14 +169,14 @@ class Traces:
     @cached_property
     def truth(self) -> Truth | None:
         topics = ("/truth/base_pose", "/truth/marker_pose", "/truth/valve_angle")
-        rows = [{t: m.values for t, m in self._messages(topic) if t >= TICK} for topic in topics]
+        rows = [{t: m.values for t, m in self._messages(topic)} for topic in topics]
         when = sorted(set(rows[0]) & set(rows[1]) & set(rows[2]))
         if not when:
             return None
         time = np.array(when)
         base, marker, angle = (np.array([found[t] for t in when]) for found in rows)
         base = np.column_stack([base[:, :2], np.unwrap(base[:, 2])])
-        return Truth(time - TICK, base, marker.reshape(-1, 3, 4), angle[:, 0] - angle[0, 0])
+        return Truth(time, base, marker.reshape(-1, 3, 4), angle[:, 0] - angle[0, 0])
 
     @cached_property
     def estimates(self) -> Estimates | None:

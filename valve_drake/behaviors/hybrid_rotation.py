@@ -91,7 +91,9 @@ def gravity_wrench(R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.n
     return np.concatenate([cross(p, force), force])
 
 
-def contact_wrench(raw: np.ndarray, bias: np.ndarray, R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.ndarray:
+def contact_wrench(
+    raw: np.ndarray, bias: np.ndarray, R_HG: np.ndarray, geometry: RobotGeometry, side: str
+) -> np.ndarray:
     """Load from outside on the hand, at its grip point, in H -> [torque; force] (6,)."""
     load = raw - bias - gravity_wrench(R_HG, geometry, side)
     p_SG = np.array([0.0, 0.0, geometry.grip_behind])
@@ -213,7 +215,8 @@ class HybridRotation:
     ) -> tuple[Memory, Command]:
         """One tick of length dt -> memory (with status and telemetry), command."""
         if mode.mode not in AT_VALVE:
-            return (memory if memory.activation < 0 else dc.replace(memory, activation=-1, status=Status())), Command(time=time)
+            idle = memory if memory.activation < 0 else dc.replace(memory, activation=-1, status=Status())
+            return idle, Command(time=time)
         q = (state.left_arm, state.right_arm)
         X = tuple(self.geometry.arm_forward(q[k], side) for k, side in enumerate(SIDES))
         m = self._sense(dt, memory, state, mode, X)
@@ -315,7 +318,8 @@ class HybridRotation:
                 extra[3:] = c.tug_speed * chain.u + chain.u * min(float(np.sum(pull)), 40.0) / (2 * c.damping)
         elif m.stage == "settle" and time - m.since > c.relax:
             if self._held(state):
-                m = dc.replace(m, stage="held", status=Status(time, m.activation, "succeeded", detail=self._openings(state)))
+                status = Status(time, m.activation, "succeeded", detail=self._openings(state))
+                m = dc.replace(m, stage="held", status=status)
             else:
                 m = self._fail(time, m, Verdict.GRASP_MISSED, self._openings(state))
         return m, twists(chain, None, c, extra), gripper
@@ -441,7 +445,8 @@ class HybridRotation:
 
     # ------------------------------------------------------------ common
     def _fail(self, time: float, m: Memory, verdict: Verdict, detail: str) -> Memory:
-        return dc.replace(m, stage="failed", status=Status(time, m.activation, "failed", verdict, detail, value=m.turned))
+        status = Status(time, m.activation, "failed", verdict, detail, value=m.turned)
+        return dc.replace(m, stage="failed", status=status)
 
     def _move(self, dt: float, m: Memory, V: np.ndarray, chain: Chain) -> Memory:
         """Integrates the hands' twists (about the chain's centre) into commanded poses and joints."""

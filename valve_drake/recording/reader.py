@@ -30,9 +30,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from valve_drake.checks import ConfigError
 from valve_drake.messages import Message
 from valve_drake.recording import schemas
-from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.container import CHUNK_SIZE, McapFile, active, open_active, publish
 from valve_drake.recording.container import Chunk as NewChunk
+from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.writer import LogError
 
 _HEAD = struct.Struct("<BQ")  # opcode, length of the body

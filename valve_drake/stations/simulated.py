@@ -24,7 +24,7 @@ from valve_drake.ports import SLOT, TICK, Block, Inputs
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.contract import CAMERAS, CONTRACT, TRUTH, check_contract
 from valve_drake.stations.scene import Scene, add_scene, panel_pose, parse, start_pose
-from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
+from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig, ValveConfig
 
 TORSO = ("waist", "neck_pitch", "neck_yaw")
 BASE = ("base_x", "base_y", "base_yaw")
@@ -220,13 +220,13 @@ class HealthSystem(Block):
         return None, {"health": Health(time=time, devices=self.DEVICES, ages=np.zeros(len(self.DEVICES)))}
 
 
-class TruthSystem(Block):
-    """What only a simulation knows, for the recorder and the metrics.
+class TruthSystem(LeafSystem):
+    """What only a simulation knows, for the recorder and the metrics; the state is that of the instant it is read.
 
     port             dir  type                notes
     ---------------  ---  ------------------  ------------------------------------------------------
     state            in   vector              of the whole plant
-    reaction_forces  in   list[SpatialForce]
+    reaction_forces  in   list[SpatialForce]  of the plant's last step
     valve_angle      out  vector(2)           opened since closed [rad], and its rate [rad/s]
     base_pose        out  vector(3)           x, y, heading in W
     marker_pose      out  vector(12)          X_WV, rows of (3, 4)
@@ -235,35 +235,40 @@ class TruthSystem(Block):
 
     OUTPUTS = {"valve_angle": 2, "base_pose": 3, "marker_pose": 12, "stem_wrench": 6}
 
-    def __init__(self, plant: MultibodyPlant, scene: Scene, bar_angle: float):
-        self.INPUTS = {"state": plant.num_multibody_states(), "reaction_forces": Value[list[SpatialForce]]()}
+    def __init__(self, plant: MultibodyPlant, scene: Scene, valve: ValveConfig):
+        super().__init__()
+        self.set_name("truth")
+        self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+        self._forces = self.DeclareAbstractInputPort("reaction_forces", Value[list[SpatialForce]]())
         stem = plant.GetJointByName("stem", scene.valve)
         self._stem = int(stem.index())
-        self._q = stem.position_start()
-        self._v = plant.num_positions() + stem.velocity_start()
+        self._q, self._v = stem.position_start(), plant.num_positions() + stem.velocity_start()
         self._base = [plant.GetJointByName(j, scene.robot).position_start() for j in BASE]
-        self._bar_angle = bar_angle
-        marker = plant.GetFrameByName("marker", scene.valve)
-        X = marker.GetFixedPoseInBodyFrame()
+        self._bar_angle = valve.bar_angle
+        self._X_WP = panel_pose(valve)
+        X = plant.GetFrameByName("marker", scene.valve).GetFixedPoseInBodyFrame()
         self._X_LinkMarker = make(X.rotation().matrix(), X.translation())
-        self._X_WP = None
-        super().__init__("truth", period=1 / 32, slot=0)
+        for name, size in self.OUTPUTS.items():
+            source = self._forces if name == "stem_wrench" else self._state
+            calc = getattr(self, f"_calc_{name}")
+            self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc={source.ticket()})
 
-    def place(self, X_WP: np.ndarray) -> "TruthSystem":
-        self._X_WP = X_WP
-        return self
+    def _calc_valve_angle(self, context: Context, output: BasicVector) -> None:
+        state = self._state.Eval(context)
+        output.SetFromVector([state[self._q] - self._bar_angle, state[self._v]])
 
-    def step(self, time: float, inputs: Inputs, memory: None) -> tuple[None, dict]:
-        state = inputs.state
-        q = state[self._q]
-        X_WLink = compose(self._X_WP, make(rotation(np.array([0, 0, -q])), np.zeros(3)))
-        F = inputs.reaction_forces[self._stem]
-        return None, {
-            "valve_angle": [q - self._bar_angle, state[self._v]],
-            "base_pose": state[self._base],
-            "marker_pose": compose(X_WLink, self._X_LinkMarker).ravel(),
-            "stem_wrench": np.concatenate([F.rotational(), F.translational()]),
-        }
+    def _calc_base_pose(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._state.Eval(context)[self._base])
+
+    def _calc_marker_pose(self, context: Context, output: BasicVector) -> None:
+        turn = make(rotation(np.array([0, 0, -self._state.Eval(context)[self._q]])), np.zeros(3))
+        output.SetFromVector(compose(self._X_WP, turn, self._X_LinkMarker).ravel())
+
+    def _calc_stem_wrench(self, context: Context, output: BasicVector) -> None:
+        forces = self._forces.Eval(context)
+        if len(forces) > self._stem:  # none before the first step
+            F = forces[self._stem]
+            output.SetFromVector(np.concatenate([F.rotational(), F.translational()]))
 
 
 def true_head(head: StereoHead, error: ErrorConfig, seed: int) -> dict[str, Mount]:
@@ -408,7 +413,7 @@ def make_simulated_station(
     health = builder.AddSystem(HealthSystem())
     builder.ExportOutput(health.GetOutputPort("health"), "health")
 
-    truth = builder.AddSystem(TruthSystem(plant, scene, valve.bar_angle).place(panel_pose(valve)))
+    truth = builder.AddSystem(TruthSystem(plant, scene, valve))
     builder.Connect(plant.get_state_output_port(), truth.GetInputPort("state"))
     builder.Connect(plant.get_reaction_forces_output_port(), truth.GetInputPort("reaction_forces"))
     for name in TruthSystem.OUTPUTS:
