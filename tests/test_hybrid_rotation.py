@@ -307,6 +307,29 @@ def test_a_stop_on_the_way_is_an_end_stop(stop, spin):
     assert bench.record()[:, 5:7].max() < 60
 
 
+def test_creep_is_no_progress_and_a_valve_that_sticks_again_and_again_is_stuck():
+    law = Bench().law
+    memory = Memory(stage="turn", mark=(0.0, 0.3), turned=0.3)
+    for k in range(300):
+        memory = law._stall(k * TICK, dc.replace(memory, turned=0.3 + 2e-5 * k), 1.0, 1.0)
+        assert (memory.stage == "back") == (k * TICK > CONFIG.stall_time)
+    assert memory.stalls == 1 and memory.stalled_at == pytest.approx(0.305, abs=0.001)
+    often = Memory(stage="turn", mark=(0.0, 0.9), turned=0.9, stalls=3, stalled_at=0.6)
+    memory = law._stall(CONFIG.stall_time + TICK, often, 1.0, 1.0)
+    assert memory.status.verdict == "stuck" and "4 times" in memory.status.detail
+
+
+def test_a_wrist_never_swings_round_at_its_limit():
+    """J4 can leave its range only by a whole turn: the hand keeps its last command instead."""
+    law = Bench().law
+    q = (np.array([1.05, 0.65, -1.9, 3.315, 1.25, 0.0]), np.array([1.05, -0.65, 1.9, 0, -1.25, 0]))
+    X = tuple(GEOMETRY.arm_forward(q[k], side) for k, side in enumerate(SIDES))
+    beyond = (GEOMETRY.arm_forward(q[0] + [0, 0, 0, 0.02, 0, 0], LEFT), X[1])
+    memory = law._command(Memory(X=X, q=q), beyond)
+    assert np.array_equal(memory.q[0], q[0]) and memory.X[0] is X[0]
+    assert memory.X[1] is X[1] and memory.q[1] == pytest.approx(q[1], abs=1e-9)
+
+
 def test_a_stop_right_at_the_start_is_an_end_stop_too():
     """It was told to close a closed valve."""
     bench = grasped(travel=(-0.005, 1.7))
@@ -413,6 +436,18 @@ def test_a_grasp_is_closed_tugged_and_relaxed():
     assert bench.command.left_gripper.tolist() == [0.0, CONFIG.grip_force]
 
 
+@pytest.mark.parametrize(
+    "opening, force, held",
+    [(0.025, 70.0, True), (0.028, 50.0, True), (0.032, 70.0, False), (0.018, 70.0, False), (0.025, 20.0, False)],
+)
+def test_what_counts_as_held(opening, force, held):
+    law = Bench().law
+    good = {"left_gripper": 0.025, "right_gripper": 0.025, "left_gripper_force": 70.0, "right_gripper_force": 70.0}
+    for side in SIDES:
+        state = RobotState(**good | {f"{side}_gripper": opening, f"{side}_gripper_force": force})
+        assert law._held(state) == held
+
+
 @pytest.mark.parametrize("hand", [0, 1])
 def test_a_hand_beside_the_bar_has_missed(hand):
     bench = Bench()
@@ -444,9 +479,11 @@ def test_release_bleeds_the_forces_before_it_opens(friction, after):
     bench.run(Mode.TURN, 0.2)
     before, angle = np.linalg.norm(bench.load[:, 3:], axis=1), bench.angle
     assert before.min() > 8
-    opened = []
+    opened, widths = [], []
 
     def watch(b):
+        if b.memory.stage == "back":
+            widths.append(min(b.gripper))
         if not opened and b.command.left_gripper[0] > 0:
             opened.append((b.time, b.load.copy(), b.X.copy()))
 
@@ -458,6 +495,7 @@ def test_release_bleeds_the_forces_before_it_opens(friction, after):
     assert np.linalg.norm(load[:, 3:], axis=1).max() < 2.0
     assert np.linalg.norm(load[:, :3], axis=1).max() < 0.5
     assert bench.angle == pytest.approx(angle, abs=1e-3) and abs(bench.angle - after) < 0.01
+    assert widths[0] > 0.9 * CONFIG.opening  # open before they are drawn back
     for k, side in enumerate(SIDES):  # hands open, drawn back along the camera's view
         assert bench.gripper[k] == pytest.approx(CONFIG.opening)
         moved = X[k][:, :3].T @ (bench.X[k][:, 3] - X[k][:, 3])
@@ -567,6 +605,17 @@ def test_the_chain_by_hand():
     assert chain_with(m1=(0.4, 0, 0)).torque == pytest.approx(0.4)  # by the wrist alone
     deeper = make_chain(np.array([[0.64, 0.15, 0.0], [0.6, -0.15, 0.0]]), np.zeros((2, 6)), np.array([-1.0, 0, 0]))
     assert deeper.b.tolist() == [0, -1, 0] and deeper.L == pytest.approx(0.3)  # across the axis
+
+
+def test_telemetry_by_hand():
+    law = Bench().law
+    t = law._telemetry(1.0, Memory(), chain_with(f1=(1, 8, 20), f2=(2, -6, 0), m2=(0, 0.5, 0)))
+    assert (t.torque, t.share_left) == (pytest.approx(3.0), pytest.approx(1.0))  # the left hand alone carries it
+    assert t.stem_force.tolist() == [3, 2, 20]
+    assert t.squeeze == pytest.approx(7.0)  # the bar pushes both hands outwards: they compress it
+    assert t.center == pytest.approx([0.6, 0, GEOMETRY.shoulder_height])  # in B
+    assert t.force_left.tolist() == [1, 8, 20] and t.moment_right.tolist() == [0, 0.5, 0]
+    assert law._telemetry(1.0, Memory(), chain_with()).share_left == 0.5
 
 
 def test_the_turned_angle_is_counted_beyond_half_a_turn():

@@ -5,7 +5,8 @@
 3. Every image column (or row, for an upright side) that crosses a side is one short profile of untouched pixels. A
    blurred step, b + A Phi(d / s) of the distance d from the side, is fitted to all of them together: levels (with a
    linear trend along the side), blur s, and the side as a smooth curve. One Gauss-Newton step per profile from there
-   gives that profile's own edge point. No pixel is interpolated or used twice, so the points' errors are independent.
+   gives that profile's own edge point. No pixel is interpolated or used twice, so the points' errors are
+   independent, but for the side's levels, whose share is counted in sigma.
 4. Points (never images) are undistorted; the straight line through them is judged, and lines meet in the corners.
 """
 
@@ -26,7 +27,7 @@ _BEFORE = [3, 0, 1, 2]
 _PRODUCT = np.repeat(np.repeat([[0, 1, 2], [1, 3, 4], [2, 4, 5]], 2, axis=0), 2, axis=1)
 _TAU_POWER = np.tile([[0, 1], [1, 2]], (3, 3))
 _REACH = 4.5  # half a profile's length that holds a blurred step [blur]
-_PAD = 12  # room round the quadrilateral [px]
+_PAD = 12  # least room round the quadrilateral [px]
 _PRIOR_POINTS = 20  # how many points the noise predicted from the grey values counts for, against the scatter seen
 
 
@@ -125,8 +126,9 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: LineF
     out: list[RawQuad] = []
     parts = []
     for k, (image, near) in enumerate(zip(images, corners)):
-        low = np.maximum(np.floor(near.min(0)).astype(int) - _PAD, 0)
-        high = np.minimum(np.ceil(near.max(0)).astype(int) + _PAD + 1, [image.shape[1], image.shape[0]])
+        pad = max(_PAD, int(0.1 * np.ptp(near, axis=0).max()))  # the ring that `_mix` looks at grows with the marker
+        low = np.maximum(np.floor(near.min(0)).astype(int) - pad, 0)
+        high = np.minimum(np.ceil(near.max(0)).astype(int) + pad + 1, [image.shape[1], image.shape[0]])
         out.append(RawQuad(reason="outside of the image"))
         if (high - low < 6).any():
             continue
