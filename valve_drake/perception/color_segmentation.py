@@ -20,7 +20,7 @@ _RED = np.array([[2.0, -1.0, -1.0]], np.float32) / 4  # opponent channels of RGB
 _GREEN = np.array([[-1.0, 2.0, -1.0]], np.float32) / 4
 
 
-_EVERY = {mode: 1 for mode in ("search", "measure", "verify")}
+_EVERY = {"search": 1, "measure": 1, "verify": 2}
 _EVERY |= {mode: 4 for mode in ("rough_approach", "fine_approach")}  # odometry is good for half a second
 _EVERY |= {mode: 16 for mode in ("reach", "servo", "grasp", "turn", "release", "retreat")}  # for the log
 _EVERY |= {mode: 0 for mode in ("idle", "done", "failed", "stopped")}
