@@ -351,7 +351,6 @@ class KinematicApproach:
         seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, turn.angle)
         missing = abs(mode.turn_angle - seen)
         detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(mode.turn_angle):.2f} deg"
-        m = dc.replace(m, status=Status(time, m.activation, "running", progress=0.0, detail=detail, value=seen))
         state_now = "succeeded" if missing <= self.config.angle_tolerance else "failed"
         verdict = Verdict.NONE if state_now == "succeeded" else Verdict.SLIP
         return dc.replace(m, status=Status(time, m.activation, state_now, verdict, detail, 1.0, seen))
