@@ -53,6 +53,12 @@ class Rig:
     def read(self, name):
         return self.station.GetOutputPort(name).Eval(self.context)
 
+    def header(self, camera):
+        """The capture that a camera would show now, without making its image."""
+        system = self.station.GetSubsystemByName(camera)
+        inner = system.GetMyContextFromRoot(self.context)
+        return inner.get_abstract_state(0).get_value().delivered
+
     def run(self, time):
         self.simulator.AdvanceTo(time)
         return self
@@ -185,13 +191,13 @@ def test_a_camera_that_nobody_reads_is_not_rendered_and_a_late_reader_sees_the_c
     rig = Rig().run(0.3)
     assert count == []
     frame = rig.read("head_left.image")
-    assert frame.time == 0.25 and frame.sequence == 2 and frame.image.shape == (480, 640, 3)
+    assert frame.time == 0.125 and frame.sequence == 1 and frame.image.shape == (480, 640, 3)
     assert rig.read("head_left.image") is frame and count == ["head_left"]
 
 
 def test_same_seed_same_image_other_seed_other_noise():
     noisy = ["simulation.camera.noise=2"]
-    a, b, c = (Rig([*noisy, f"seed={s}"]).run(0.01).read("head_left.image") for s in (1, 1, 2))
+    a, b, c = (Rig([*noisy, f"seed={s}"]).run(0.07).read("head_left.image") for s in (1, 1, 2))
     assert a.data == b.data != c.data
 
 
@@ -213,3 +219,14 @@ def test_true_head_is_the_calibration_when_there_are_no_errors():
     mounts = simulated.true_head(head, zero, 1)
     np.testing.assert_array_equal(mounts["head_left"].X_FC, make(np.eye(3), np.zeros(3)))
     np.testing.assert_allclose(mounts["head_right"].X_FC, head.X_LR)
+
+
+@pytest.mark.parametrize("latency", [0.0, 1 / 64, 1 / 8, 3 / 16])
+def test_an_image_is_there_when_its_latency_has_passed_and_not_before(latency):
+    rig = Rig([f"simulation.camera.latency={latency}"])
+    for k in range(1, 40):
+        now = rig.run(k / 128).context.get_time()  # before the updates at `now`
+        arrived = int(np.ceil((now - latency) / 0.125)) - 1  # captured every 1/8 s
+        header = rig.header("head_left")
+        assert header.sequence == max(arrived, -1)
+        assert header.time == max(arrived, -1) * 0.125 or header.sequence == -1

@@ -180,6 +180,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.profile and not options.json:
         for kind, share in sorted(result.shares.items(), key=lambda item: -item[1]):
             print(f"{kind:>10}  {100 * share:5.1f} %  {share * result.wall_time:6.2f} s")
+        print(f"{result.beside:.2f} s of rendering on other processors; above, what the run waited for")
     if result.log_error:
         print(f"valve-drake: {result.log_error}", file=sys.stderr)
         return FAILED

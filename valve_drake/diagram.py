@@ -35,6 +35,7 @@ from valve_drake.perception.stereo_positioning_system import StereoPositioningSy
 from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.robot_state_system import RobotStateSystem
 from valve_drake.scenario import Scenario
+from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CONTRACT
 from valve_drake.stations.replay import Recording, make_replay_station
 from valve_drake.stations.simulated import make_simulated_station
@@ -113,7 +114,12 @@ def initial_commands(scenario: Scenario) -> dict[str, np.ndarray]:
     return out
 
 
-def make_station(scenario: Scenario, meshcat: Meshcat | None = None, recording: Recording | None = None) -> Diagram:
+def make_station(
+    scenario: Scenario,
+    meshcat: Meshcat | None = None,
+    recording: Recording | None = None,
+    workers: CameraWorkers | None = None,
+) -> Diagram:
     """The station that a resolved scenario names; `replay` shows a recording."""
     if scenario.station == "replay":
         if recording is None:
@@ -127,6 +133,7 @@ def make_station(scenario: Scenario, meshcat: Meshcat | None = None, recording: 
         scenario.kinematic_approach.opening,
         scenario.seed,
         meshcat,
+        workers,
     )
 
 
@@ -166,14 +173,15 @@ def make_diagram(
     *,
     meshcat: Meshcat | None = None,
     recording: Recording | None = None,
+    workers: CameraWorkers | None = None,
     truth: bool = True,
 ) -> System:
     """The whole system for a resolved scenario; `recording` is what station `replay` shows.
 
-    truth=False leaves the recorder without the `truth.*` ports.
+    workers: make the simulated cameras' images beside the run. truth=False leaves the recorder without the `truth.*` ports.
     """
     builder = DiagramBuilder()
-    station = builder.AddSystem(make_station(scenario, meshcat, recording))
+    station = builder.AddSystem(make_station(scenario, meshcat, recording, workers))
     station.set_name("station")  # whichever it is: the wiring is the same
     blocks = {block.get_name(): block for block in make_blocks(scenario)}
     for block in blocks.values():

@@ -34,7 +34,12 @@ class Profile:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.beside = 0.0  # processor time of other processes that make images
         self._stack: list[list] = []
+
+    def clear(self) -> None:
+        self.seconds.clear()
+        self.beside = 0.0
 
     def __call__(self, kind: str) -> "Profile":
         self._stack.append([kind, _time.perf_counter(), 0.0])

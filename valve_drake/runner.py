@@ -34,6 +34,7 @@ from valve_drake.recording.robot_frames import RobotFrames, pinholes
 from valve_drake.recording.signals import signals
 from valve_drake.recording.writer import LogError, LogWriter
 from valve_drake.scenario import Scenario, dump, parse, resolve, with_overrides
+from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.replay import Recording
 
 STEP = 1 / 32  # between two looks at the mode [s]
@@ -60,7 +61,8 @@ class Result:
     log: Path
     html: Path | None
     log_error: str
-    shares: dict[str, float]  # of the wall time, by kind of work
+    shares: dict[str, float]  # of the wall time, by kind of work; of rendering, what the run waited for
+    beside: float  # processor time of rendering beside the run [s]
 
     def as_json(self) -> dict:
         """The object of `run --json`."""
@@ -83,6 +85,7 @@ class Result:
             "turn_mean_stem_force_N": s.turn_mean_stem_force_N,
             "turn_share_left": s.turn_share_left,
             "shares": {kind: round(share, 4) for kind, share in self.shares.items()},
+            "rendering_beside_s": self.beside,
             "log": str(self.log),
             "log_error": self.log_error,
             "recording": str(self.html) if self.html else None,
@@ -141,12 +144,13 @@ def run(
     if html is not None or meshcat_port is not None:
         meshcat = Meshcat(MeshcatParams(host="localhost", port=meshcat_port))
         meshcat.SetCameraPose(np.array([-3.0, -2.6, 2.3]), np.array([-0.6, 0.0, 0.9]))
-    profile.seconds.clear()
+    profile.clear()
     writer = LogWriter(log)
-    with _log_kept(writer):
+    with _log_kept(writer), CameraWorkers() as workers:
         _begin_log(writer, scenario)
         sink = writer if live is None else Tee(writer, live)
-        system = make_diagram(scenario, make_recorder(sink, scenario), meshcat=meshcat, truth=truth)
+        recorder = make_recorder(sink, scenario)
+        system = make_diagram(scenario, recorder, meshcat=meshcat, workers=workers, truth=truth)
         simulator = Simulator(system.diagram)
         if html is not None:
             meshcat.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat_port is not None)
@@ -161,7 +165,7 @@ def run(
     shares = {kind: seconds / wall for kind, seconds in profile.seconds.items()}
     shares["physics"] = 1.0 - sum(shares.values())
     written = log if not writer.error else active(log)
-    return Result(summarize(written), wall, written, html, writer.error, shares)
+    return Result(summarize(written), wall, written, html, writer.error, shares, profile.beside)
 
 
 def _begin_log(writer: LogWriter, scenario: Scenario, **facts: str) -> None:

@@ -19,7 +19,7 @@ from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import LEFT, SIDES
 from valve_drake.perception.handle_marker import find_mark
 from valve_drake.scenario import Scenario, resolve
-from valve_drake.stations.camera_rig import CameraRig
+from valve_drake.stations.camera_rig import CameraRig, Capture
 from valve_drake.stations.scene import panel_pose, start_pose
 from valve_drake.stations.simulated import BASE, arm_joints, make_mounts
 from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
@@ -58,7 +58,7 @@ def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.
             if q is None:
                 raise ConfigError(f"teach: the {side} hand does not reach a probe at {offset} m")
             positions = _positions(rig, base, q0 | {side: q}, scenario.kinematic_approach.opening)
-            frames = [rig.frame(f"{side}_wrist", positions, 0.0, k) for k in range(IMAGES)]
+            frames = [rig.frame(f"{side}_wrist", Capture(0.0, k, positions)) for k in range(IMAGES)]
             marks = [find_mark(frame.image, scenario.handle_marker) for frame in frames]
             if not all(mark.found for mark in marks):
                 raise ConfigError(f"teach: no mark in the {side} wrist image: {marks[0].reason}")

@@ -1,7 +1,7 @@
 """The simulated cameras: rendered images through a real lens, blur, noise and JPEG.
 
 `CameraRig` owns a scene of its own, made only to be rendered; a camera block keeps the joint positions at capture
-time and renders from them when somebody reads its port. So an image shows the instant it was taken, whenever it is
+time and delivers the image made from them `latency` later. So an image shows the instant it was taken, whenever it is
 read, and a camera that nobody looks at costs nothing.
 
 Pixel convention: Drake's renderer puts the centre of the first pixel at (0.5, 0.5), everybody else here at (0, 0).
@@ -10,7 +10,8 @@ It is converted in `_Lensed.__init__` alone.
 
 import dataclasses as dc
 import functools
-from collections.abc import Callable, Mapping
+import typing
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -133,18 +134,21 @@ class CameraRig:
         self.pose(q)
         return lensed(self._render(self.plant.GetFrameByName(mount.frame), mount.X_FC, lensed.info))
 
-    def frame(self, name: str, q: np.ndarray, time: float, sequence: int) -> CameraFrame:
+    def captured(self, name: str, capture: "Capture") -> None:
+        """Nothing to do ahead: images are made where they are read."""
+
+    def frame(self, name: str, capture: "Capture") -> CameraFrame:
         """What the camera delivers: lens, blur, white balance, noise, JPEG and back."""
-        image = self.ideal(name, q)
+        image = self.ideal(name, capture.q)
         c = self._camera
         if c.blur > 0:
             image = cv2.GaussianBlur(image, (0, 0), c.blur)
-        rng = np.random.Generator(np.random.SFC64([self._seed, self._names.index(name), sequence]))
+        rng = np.random.Generator(np.random.SFC64([self._seed, self._names.index(name), capture.sequence]))
         start = int(rng.integers(len(self._noise) - image.size))
         noise = self._noise[start : start + image.size].reshape(image.shape)
         values = cv2.multiply(image, (*self._gains, 0.0), dtype=cv2.CV_32F)
         values = cv2.scaleAdd(noise, c.noise, values)
-        return encode_frame(name, time, sequence, cv2.convertScaleAbs(cv2.max(values, 0.0)), c.jpeg_quality)
+        return encode_frame(name, capture.time, capture.sequence, cv2.convertScaleAbs(cv2.max(values, 0.0)), c.jpeg_quality)
 
     def view(self, X_WC: np.ndarray, q: np.ndarray, width: int, height: int, fov_y: float) -> np.ndarray:
         """A picture from anywhere, for people (height, width, 3)."""
@@ -181,13 +185,31 @@ def decode_image(data: bytes) -> np.ndarray:
 
 @dc.dataclass(frozen=True)
 class Capture:
-    """The state of a camera: the joint positions at the last capture."""
+    """What a camera caught: when, which one, and the plant's positions then."""
 
     time: float = -1.0
     sequence: int = -1
     q: np.ndarray | None = None
 
-    def __deepcopy__(self, memo: dict) -> "Capture":
+
+class Images(typing.Protocol):
+    """Who makes the images: `CameraRig` here and now, `CameraWorkers` beside the run."""
+
+    def captured(self, name: str, capture: Capture) -> None:
+        """Told of every capture, looked at or not, so that its image can be begun ahead."""
+
+    def frame(self, name: str, capture: Capture) -> CameraFrame:
+        """The image of a capture."""
+
+
+@dc.dataclass(frozen=True)
+class _Film:
+    """The state of a camera: what was delivered last, and what is on its way, oldest first."""
+
+    delivered: Capture = Capture()
+    coming: tuple[Capture, ...] = ()
+
+    def __deepcopy__(self, memo: dict) -> "_Film":
         return self
 
 
@@ -195,37 +217,48 @@ class CameraSystem(LeafSystem):
     """One camera of the simulated station.
 
     port       dir  type         notes
-    ---------  ---  -----------  ---------------------------------------------
+    ---------  ---  -----------  --------------------------------------------------------
     positions  in   vector       of the whole plant
-    image      out  CameraFrame  of the last capture; rendered when it is read
+    image      out  CameraFrame  captured `latency` ago or earlier; made when it is read
     """
 
-    def __init__(
-        self, name: str, positions: int, period: float, render: Callable[[np.ndarray, float, int], CameraFrame]
-    ):
+    def __init__(self, name: str, positions: int, period: float, latency: float, images: Images):
         super().__init__()
         self.set_name(name)
-        self._render = render
+        self._latency = latency
+        self._images = images
         self._positions = self.DeclareVectorInputPort("positions", positions)
-        self._capture = self.DeclareAbstractState(Value(Capture()))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+        self._film = self.DeclareAbstractState(Value(_Film()))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._capture)
+        if latency % period:
+            self.DeclarePeriodicUnrestrictedUpdateEvent(period, latency % period, self._deliver)
         self.DeclareAbstractOutputPort(
             "image",
             functools.partial(Value, CameraFrame()),
             self._calc_image,
-            prerequisites_of_calc={self.abstract_state_ticket(self._capture)},
+            prerequisites_of_calc={self.abstract_state_ticket(self._film)},
         )
 
-    def _update(self, context: Context, state: State) -> None:
-        old = context.get_abstract_state(int(self._capture)).get_value()
-        q = np.array(self._positions.Eval(context))
-        new = Capture(context.get_time(), old.sequence + 1, q)
-        state.get_mutable_abstract_state().get_mutable_value(int(self._capture)).set_value(new)
+    def _capture(self, context: Context, state: State) -> None:
+        film = context.get_abstract_state(int(self._film)).get_value()
+        last = film.coming[-1] if film.coming else film.delivered
+        new = Capture(context.get_time(), last.sequence + 1, np.array(self._positions.Eval(context)))
+        self._images.captured(self.get_name(), new)
+        self._advance(dc.replace(film, coming=(*film.coming, new)), context.get_time(), state)
+
+    def _deliver(self, context: Context, state: State) -> None:
+        self._advance(context.get_abstract_state(int(self._film)).get_value(), context.get_time(), state)
+
+    def _advance(self, film: _Film, time: float, state: State) -> None:
+        due = [c for c in film.coming if c.time <= time - self._latency]
+        if due:
+            film = _Film(due[-1], film.coming[len(due) :])
+        state.get_mutable_abstract_state().get_mutable_value(int(self._film)).set_value(film)
 
     def _calc_image(self, context: Context, output: Value) -> None:
-        capture = context.get_abstract_state(int(self._capture)).get_value()
+        capture = context.get_abstract_state(int(self._film)).get_value().delivered
         if capture.sequence < 0:
             output.set_value(CameraFrame(camera=self.get_name()))
             return
         with profile("rendering"):
-            output.set_value(self._render(capture.q, capture.time, capture.sequence))
+            output.set_value(self._images.frame(self.get_name(), capture))

@@ -22,6 +22,7 @@ from valve_drake.frames import compose, make, rotation
 from valve_drake.messages import SIDES, Health
 from valve_drake.ports import SLOT, TICK, Block, Inputs
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
+from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, CONTRACT, TRUTH, check_contract
 from valve_drake.stations.scene import Scene, add_scene, panel_pose, parse, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig, ValveConfig
@@ -334,8 +335,12 @@ def make_simulated_station(
     opening: float,
     seed: int,
     meshcat: Meshcat | None = None,
+    workers: CameraWorkers | None = None,
 ) -> Diagram:
-    """The station as a Diagram. simulation: resolved (no distributions left); home: both arms (12,) [rad]."""
+    """The station as a Diagram. simulation: resolved (no distributions left); home: both arms (12,) [rad].
+
+    workers: make the images there; else they are made when they are read.
+    """
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=SLOT, discrete_contact_approximation="lagged", contact_model="point", stiction_tolerance=1e-4
@@ -398,17 +403,17 @@ def make_simulated_station(
     for side in SIDES:
         builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
 
-    rig = CameraRig(make_mounts(head, simulation, seed), valve, marker_size, simulation.light, simulation.camera, seed)
+    camera = simulation.camera
+    rig = (make_mounts(head, simulation, seed), valve, marker_size, simulation.light, camera, seed)
+    images = CameraRig(*rig) if workers is None else workers.start(*rig)
     positions = builder.AddSystem(MatrixGain(np.eye(plant.num_positions(), plant.num_multibody_states())))
     positions.set_name("positions")
     builder.Connect(plant.get_state_output_port(), positions.get_input_port())
     for name in CAMERAS:
-        period = simulation.camera.head_period if name.startswith("head") else simulation.camera.wrist_period
-        camera = builder.AddSystem(
-            CameraSystem(name, plant.num_positions(), period, lambda q, t, k, n=name: rig.frame(n, q, t, k))
-        )
-        builder.Connect(positions.get_output_port(), camera.GetInputPort("positions"))
-        builder.ExportOutput(camera.GetOutputPort("image"), f"{name}.image")
+        period = camera.head_period if name.startswith("head") else camera.wrist_period
+        system = builder.AddSystem(CameraSystem(name, plant.num_positions(), period, camera.latency, images))
+        builder.Connect(positions.get_output_port(), system.GetInputPort("positions"))
+        builder.ExportOutput(system.GetOutputPort("image"), f"{name}.image")
 
     health = builder.AddSystem(HealthSystem())
     builder.ExportOutput(health.GetOutputPort("health"), "health")

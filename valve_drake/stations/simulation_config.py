@@ -60,6 +60,7 @@ class CameraConfig:
     blur: Number = 0.5  # standard deviation of the optical blur [px]
     head_period: float = 0.125  # [s]
     wrist_period: float = 0.0625
+    latency: float = 0.0625  # from the capture to the image being there: exposure, compression, wire [s]
     wrist_focal: Number = 480.0  # [px]
     jpeg_quality: int = 95
     supersample: int = 1  # 2: rendered at twice the size and averaged
@@ -112,6 +113,7 @@ class SimulationConfig:
             "camera.blur": (0.0, 5.0),
             "camera.head_period": (1 / 32, 2.0),
             "camera.wrist_period": (1 / 32, 2.0),
+            "camera.latency": (0.0, 0.5),
             "camera.wrist_focal": (200.0, 900.0),
             "camera.jpeg_quality": (50, 100),
             "camera.supersample": (1, 4),
@@ -125,6 +127,6 @@ class SimulationConfig:
                 require_in(end, low, high, f"simulation.{key}")
             if isinstance(value, Uniform):
                 require(value.min <= value.max, f"simulation.{key}", "a range with min <= max", (value.min, value.max))
-        for key in ("head_period", "wrist_period"):
+        for key in ("head_period", "wrist_period", "latency"):
             ticks = getattr(self.camera, key) * 128
             require(ticks == int(ticks), f"simulation.camera.{key}", "a multiple of 1/128 s", getattr(self.camera, key))

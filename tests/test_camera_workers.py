@@ -1,0 +1,84 @@
+"""camera_workers: the same images as the rig's, made in other processes and begun ahead."""
+
+import gc
+
+import numpy as np
+import pytest
+
+from valve_drake import resources, scenario
+from valve_drake.camera.lens import load_head
+from valve_drake.stations.camera_rig import CameraRig, Capture
+from valve_drake.stations.camera_workers import CameraWorkers
+from valve_drake.stations.simulated import make_mounts
+
+
+@pytest.fixture(scope="module")
+def rig_arguments():
+    sc = scenario.resolve(scenario.load(None, ["seed=5", "simulation.camera.noise=2", "simulation.camera.blur=0.5"]))
+    head = load_head(resources.find(sc.head_calibration, resources.models()))
+    mounts = make_mounts(head, sc.simulation, 5)
+    return mounts, sc.simulation.valve, tuple(sc.marker.size), sc.simulation.light, sc.simulation.camera, 5
+
+
+@pytest.fixture(scope="module")
+def rig(rig_arguments):
+    return CameraRig(*rig_arguments)
+
+
+@pytest.fixture
+def workers(rig_arguments):
+    with CameraWorkers() as workers:
+        yield workers.start(*rig_arguments)
+
+
+def captures(rig, count, offset=0.0):
+    """The head turns a little from one to the next."""
+    out = []
+    for k in range(count):
+        q = np.zeros(rig.plant.num_positions())
+        q[rig.plant.GetJointByName("base_x").position_start()] = -1.5
+        q[rig.plant.GetJointByName("neck_yaw").position_start()] = offset + 0.02 * k
+        out.append(Capture(k / 8, k, q))
+    return out
+
+
+def test_images_of_both_eyes_are_the_rigs_own_to_the_bit(rig, workers):
+    for capture in captures(rig, 3):
+        for name in ("head_left", "head_right"):
+            workers.captured(name, capture)
+        for name in ("head_left", "head_right"):
+            made, own = workers.frame(name, capture), rig.frame(name, capture)
+            assert made.data == own.data
+            assert (made.camera, made.time, made.sequence) == (name, capture.time, capture.sequence)
+            np.testing.assert_array_equal(made.image, own.image)
+
+
+def test_what_is_read_regularly_is_begun_at_its_capture_and_nothing_else(rig, workers):
+    shots = captures(rig, 7)
+    for capture in shots[:4]:
+        workers.captured("head_left", capture)
+    workers.frame("head_left", shots[1])
+    workers.frame("head_left", shots[3])  # every second one
+    for capture in shots[4:]:
+        workers.captured("head_left", capture)
+    assert set(workers._asked["head_left"]) - {1, 3} == {5}
+    assert workers.frame("head_left", shots[5]).data == rig.frame("head_left", shots[5]).data
+    assert workers.frame("head_left", shots[6]).data == rig.frame("head_left", shots[6]).data  # not foreseen
+
+
+def test_a_simulation_begun_anew_gets_its_own_images(rig, workers):
+    first, second = captures(rig, 1)[0], captures(rig, 1, offset=0.2)[0]
+    assert workers.frame("left_wrist", first).data == rig.frame("left_wrist", first).data
+    anew = workers.frame("left_wrist", second)
+    assert anew.data == rig.frame("left_wrist", second).data
+
+
+def test_the_processes_end_with_the_block_and_a_lost_one_is_named(rig, rig_arguments):
+    with CameraWorkers() as workers:
+        workers.start(*rig_arguments)
+        processes = [worker.process for worker in workers._workers]
+        processes[0].kill()
+        with pytest.raises(RuntimeError, match="renders head_left ended with code -9"):
+            workers.frame("head_left", captures(rig, 1)[0])
+    assert all(process.poll() is not None for process in processes)
+    gc.collect()

@@ -1,0 +1,130 @@
+"""Images made beside the run: a process for the left eye of each pair and one for the right.
+
+Rendering is the dearest work of a run after the contact physics, and an image needs nothing but the positions at its
+capture. So it is begun when it is captured, if it will be looked at, and is fetched when it is: the same bits as
+`CameraRig.frame`, sooner. What is foreseen wrongly costs time and changes nothing.
+"""
+
+import collections
+import dataclasses as dc
+import multiprocessing.connection
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+
+from valve_drake.messages import CameraFrame
+from valve_drake.ports import profile
+from valve_drake.stations.camera_rig import CameraRig, Capture
+from valve_drake.stations.contract import CAMERAS
+
+WORKERS = 2
+KEPT = 8  # captures of a camera that may still be asked for
+
+
+@dc.dataclass
+class _Worker:
+    process: subprocess.Popen
+    wire: multiprocessing.connection.Connection
+
+
+class CameraWorkers:
+    """Makes images in other processes while open; `start` says of what. Use: `with CameraWorkers() as workers:`."""
+
+    def __init__(self) -> None:
+        self._workers: list[_Worker] = []
+        self._captures = {name: collections.deque(maxlen=KEPT) for name in CAMERAS}
+        self._asked: dict[str, dict[int, Capture]] = {name: {} for name in CAMERAS}
+        self._made: dict[tuple[str, int], CameraFrame] = {}
+        self._read: dict[str, tuple[int, int]] = {}  # sequence read last, and how many captures after the one before
+
+    def __enter__(self) -> "CameraWorkers":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for worker in self._workers:
+            worker.wire.close()  # which ends it
+        for worker in self._workers:
+            worker.process.wait()
+        self._workers = []
+
+    def start(self, *rig: object) -> "CameraWorkers":
+        """Starts the processes. rig: the arguments of CameraRig."""
+        for _ in range(WORKERS):
+            here, there = socket.socketpair()
+            with there:
+                code = f"from valve_drake.stations.camera_workers import serve; serve({there.fileno()})"
+                process = subprocess.Popen([sys.executable, "-c", code], pass_fds=[there.fileno()])
+            worker = _Worker(process, multiprocessing.connection.Connection(here.detach()))
+            worker.wire.send(rig)
+            self._workers.append(worker)
+        return self
+
+    def captured(self, name: str, capture: Capture) -> None:
+        """Begins the image if the reader's habit says that this one will be looked at."""
+        self._captures[name].append(capture)
+        last, stride = self._read.get(name, (0, 0))
+        if stride and capture.sequence == last + stride:
+            self._ask(name, capture)
+
+    def frame(self, name: str, capture: Capture) -> CameraFrame:
+        """The image of a capture. Raises RuntimeError if the process that makes it has ended."""
+        self._ask(name, capture)
+        k = CAMERAS.index(name) ^ 1  # who reads one eye reads the other next
+        for other in self._captures[CAMERAS[k]]:
+            if (other.sequence, other.time) == (capture.sequence, capture.time):
+                self._ask(CAMERAS[k], other)
+        while (name, capture.sequence) not in self._made:
+            self._receive(name)
+        last, _ = self._read.get(name, (capture.sequence, 0))
+        if capture.sequence != last:
+            self._read[name] = (capture.sequence, max(capture.sequence - last, 0))
+        else:
+            self._read.setdefault(name, (capture.sequence, 0))
+        frame = self._made[name, capture.sequence]
+        for sequence in [s for s in self._asked[name] if s < capture.sequence and (name, s) in self._made]:
+            del self._asked[name][sequence], self._made[name, sequence]
+        return frame
+
+    def _ask(self, name: str, capture: Capture) -> None:
+        asked = self._asked[name].get(capture.sequence)
+        if asked is not None and asked.time == capture.time and np.array_equal(asked.q, capture.q):
+            return
+        if asked is not None:  # a simulation begun anew
+            while (name, capture.sequence) not in self._made:
+                self._receive(name)
+            del self._made[name, capture.sequence]
+        self._asked[name][capture.sequence] = capture
+        self._worker(name).wire.send((name, capture))
+
+    def _worker(self, name: str) -> _Worker:
+        return self._workers[CAMERAS.index(name) % WORKERS]
+
+    def _receive(self, name: str) -> None:
+        worker = self._worker(name)
+        try:
+            frame, seconds = worker.wire.recv()
+        except (EOFError, OSError) as error:
+            raise RuntimeError(f"the process that renders {name} ended with code {worker.process.wait()}") from error
+        profile.beside += seconds
+        self._made[frame.camera, frame.sequence] = frame
+
+
+def serve(fd: int) -> None:
+    """The other process: builds the rig, makes what it is asked for, ends when nobody is left to ask."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides when it ends
+    cv2.setNumThreads(1)
+    wire = multiprocessing.connection.Connection(fd)
+    try:
+        rig = CameraRig(*wire.recv())
+        while True:
+            name, capture = wire.recv()
+            begin = time.process_time()
+            frame = rig.frame(name, capture)
+            wire.send((frame, time.process_time() - begin))
+    except (EOFError, ConnectionError):
+        pass
