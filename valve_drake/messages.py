@@ -38,7 +38,9 @@ class Message:
             value = getattr(self, name)
             if value is None and optional:
                 continue
-            value = np.array(value, dtype=np.float64)
+            frozen = type(value) is np.ndarray and value.base is None and not value.flags.writeable
+            if not (frozen and value.dtype == np.float64):  # one that nobody can change is shared
+                value = np.array(value, dtype=np.float64)
             if value.size == 0 and -1 in shape:
                 value = value.reshape([0 if n < 0 else n for n in shape])
             if value.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, value.shape)):
@@ -169,6 +171,9 @@ class QuadEdges(Message):
     side: np.ndarray = array(-1)  # 0..3: the side that each point belongs to
     sigma: float = 0.0  # standard deviation of a point along the edge's normal [px]
     corners: np.ndarray = array(4, 2)  # intersections of the fitted lines, normalised
+    # Of the distances of eight points, two on each side of `corners` at joint_fit.NODES of its length, from the side
+    # (px of the raw image, positive inward); all zero where the points are all that is known [1/px^2].
+    information: np.ndarray = array(8, 8)
     corners_px: np.ndarray = array(4, 2)  # the same in the raw image [px]
     center_px: np.ndarray = array(2)  # centroid of the coloured area in the raw image [px]
     green: np.ndarray = array(-1, 2)  # green marks (x', y'), normalised

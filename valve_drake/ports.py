@@ -69,9 +69,12 @@ class Inputs:
 
     def __getattr__(self, name: str) -> Any:
         port, kind = self._block.input_ports[name]
-        if not port.HasValue(self._context):
+        try:
+            value = port.Eval(self._context)
+        except RuntimeError:  # also what Drake says of a port without a value; asking first would evaluate it twice
+            if port.HasValue(self._context):
+                raise
             return None
-        value = port.Eval(self._context)
         if isinstance(kind, type) and not isinstance(value, kind):
             # Connect() cannot check this: Drake sees every Python message as Value[object].
             raise TypeError(f"{port.GetFullDescription()}: want {kind.__name__}, got {type(value).__name__}")
