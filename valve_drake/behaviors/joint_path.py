@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 Free = Callable[[np.ndarray], bool]
-STEP = 0.06  # largest joint step between two checks [rad]
+STEP = 0.03  # largest joint step between two checks [rad]
+LEAVE = 0.06  # the robot is at the start, free or not: this near to it nothing is asked [rad]
 
 
 @dc.dataclass(frozen=True)
@@ -71,12 +72,16 @@ def find_path(
     """Way points (N, 12) from start to goal, or None. The start itself may touch (it is where the robot is)."""
     if not is_free(goal):
         return None
-    if line_is_free(start, goal, is_free):
+
+    def free(q: np.ndarray) -> bool:
+        return bool(np.max(np.abs(q - start)) < LEAVE) or is_free(q)
+
+    if line_is_free(start, goal, free):
         return np.array([start, goal])
     for via in vias:
-        if line_is_free(start, via, is_free) and line_is_free(via, goal, is_free):
+        if line_is_free(start, via, free) and line_is_free(via, goal, free):
             return np.array([start, via, goal])
-    return _rrt_connect(start, goal, is_free, tries)
+    return _rrt_connect(start, goal, free, tries)
 
 
 def _rrt_connect(start: np.ndarray, goal: np.ndarray, is_free: Free, tries: int) -> np.ndarray | None:
