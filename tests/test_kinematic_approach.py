@@ -15,7 +15,7 @@ from valve_drake.behaviors.grasp_geometry import (
     turn_between,
     turned,
 )
-from valve_drake.behaviors.kinematic_approach import CONTACT, KinematicApproach, KinematicApproachConfig, Memory
+from valve_drake.behaviors.kinematic_approach import OTHERS, KinematicApproach, KinematicApproachConfig, Memory
 from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
@@ -148,7 +148,7 @@ def assert_smooth(commands: list[np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize(
-    "mode", [Mode.IDLE, Mode.SEARCH, Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT, Mode.DONE]
+    "mode", [Mode.IDLE, Mode.SEARCH, Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT]
 )
 def test_where_it_has_nothing_else_to_do_the_arms_go_home_and_stay(base, mode):
     bench = Bench(base, arms=HOME + np.tile([0.2, -0.1, 0.3, 0.4, -0.2, 0.1], 2))
@@ -169,8 +169,8 @@ def test_home_mirrors_from_left_to_right(base):
     assert right == pytest.approx(left * [1, -1, 1])
 
 
-@pytest.mark.parametrize("mode", CONTACT)
-def test_in_contact_the_arms_belong_to_others_and_the_next_motion_starts_where_they_are(base, mode):
+@pytest.mark.parametrize("mode", OTHERS)
+def test_in_contact_and_at_the_end_the_arms_belong_to_others_and_the_next_motion_starts_where_they_are(base, mode):
     bench = Bench(base)
     bench.run(Mode.IDLE, limit=0.1)
     bench.run(mode, limit=0.05)
@@ -421,16 +421,19 @@ def test_the_way_home_keeps_clear_of_the_valve_as_the_hands_left_it(base):
     assert turn_between(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.0)  # on the way there
 
 
-def test_an_early_retreat_keeps_clear_of_the_valve_too(base):
+@pytest.mark.parametrize("mode", [Mode.RETREAT, Mode.IDLE, Mode.SEARCH])
+def test_an_early_retreat_or_a_reset_at_the_valve_keeps_clear_of_it_too(base, mode):
     asked = []
     bench = Bench(base, lambda X_BV, q: not asked.append(X_BV)).at_standoff()
     bench.turn = TurnState(angle=0.4)
+    bench.run(Mode.STOPPED, limit=0.1)
     asked.clear()
-    bench.run(Mode.RETREAT, limit=0.1)
+    bench.run(mode, limit=0.1)
     assert turn_between(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.4)
-    bench = Bench(base, lambda X_BV, q: not asked.append(X_BV), arms=HOME + 0.1)
+    bench.run(Mode.STOPPED, limit=0.1)
+    bench.base = bench.base - [1.5 * np.cos(bench.base[2]), 1.5 * np.sin(bench.base[2]), 0]  # away from it
     asked.clear()
-    bench.run(Mode.ROUGH_APPROACH, limit=0.1)
+    bench.run(mode, limit=0.1)
     assert asked and all(X_BV is None for X_BV in asked)  # far from any valve
 
 

@@ -91,7 +91,9 @@ class Memory:
     status: Status = Status()
 
 
-CONTACT = (Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE)  # the arms belong to others
+# The arms belong to others, or are held where they are: what comes next starts from there.
+OTHERS = (Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE, Mode.DONE, Mode.FAILED, Mode.STOPPED)
+NEAR = 1.5  # a valve farther from the base than this is out of the arms' way [m]
 
 
 class KinematicApproach:
@@ -142,9 +144,9 @@ class KinematicApproach:
         if mode.activation != m.activation:
             m = dc.replace(m, activation=mode.activation, mode=mode.mode, phase="start", since=time, looks=())
             m = dc.replace(m, status=Status(time=time, activation=mode.activation, state="idle"))
-        if m.q is None or mode.mode in CONTACT:
+        if m.q is None or mode.mode in OTHERS:
             m = dc.replace(m, q=measured, path=None)
-        if mode.mode in CONTACT:
+        if mode.mode in OTHERS:
             return m, Command(time=time)
         run = {Mode.MEASURE: self._measure, Mode.REACH: self._reach, Mode.VERIFY: self._verify}
         if mode.mode in run:
@@ -154,8 +156,7 @@ class KinematicApproach:
                 m = self._watch_stance(time, m, mode, estimate)
             elif mode.mode == Mode.SEARCH:
                 m = dc.replace(m, stance=Stance(), stance_looks=())
-            near = mode.mode == Mode.RETREAT and m.plan.found  # the base has not left the valve yet
-            m = self._homing(time, m, turned(m.plan.X_BV, turn.angle) if near else None)
+            m = self._homing(time, m, self._valve(m, state, turn))
         if m.path is not None:
             m = dc.replace(m, q=m.path.sample(time))
         gripper = np.array([self.config.opening, self.config.gripper_force])
@@ -163,6 +164,13 @@ class KinematicApproach:
 
     def _status(self, m: Memory, time: float, state: str, verdict: str = "", detail: str = "") -> Memory:
         return dc.replace(m, status=Status(time, m.activation, state, verdict, detail))
+
+    def _valve(self, m: Memory, state: RobotState, turn: TurnState) -> np.ndarray | None:
+        """X_BV of the valve that was measured last, as the hands left it; None if there is none near."""
+        if m.X_OV0 is None:
+            return None
+        X_BV = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OV0, turn.angle))
+        return X_BV if np.hypot(*X_BV[:2, 3]) < NEAR else None
 
     def _homing(self, time: float, m: Memory, X_BV: np.ndarray | None) -> Memory:
         """Brings the arms home along a free path, once per activation; m.path is the move, phase "home" on arrival."""
