@@ -11,10 +11,17 @@ from drawn_scene import RED, Drawing, draw_valve, facing
 from helpers import Rig, ports, same
 
 from valve_drake import frames
+from valve_drake.analysis.drawn_images import METAL, Canvas, draw_bar
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError
 from valve_drake.messages import CameraFrame, ModeState
-from valve_drake.perception.color_segmentation import ColorSegmentationConfig, polygon_area, quadrilateral, segment
+from valve_drake.perception.color_segmentation import (
+    ColorSegmentationConfig,
+    middle,
+    polygon_area,
+    quadrilateral,
+    segment,
+)
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
 from valve_drake.perception.marker import Marker
 
@@ -108,6 +115,47 @@ def test_quadrilateral_turns_clockwise_and_a_triangle_is_none():
     d = np.roll(corners, -1, 0) - corners
     assert (d[:, 0] * np.roll(d, -1, 0)[:, 1] - d[:, 1] * np.roll(d, -1, 0)[:, 0] > 0).all()
     assert quadrilateral(np.array([[0, 0], [60, 0], [30, 50]])) is None
+
+
+def test_a_covered_corner_is_where_its_sides_would_meet():
+    square = np.array([[10, 10], [110, 20], [100, 120], [5, 105]])
+    for k in range(4):
+        before, corner, after = square[k - 1], square[k], square[(k + 1) % 4]
+        cut = [corner + 0.2 * (before - corner), corner + 0.3 * (after - corner)]
+        outline = np.vstack([square[:k], cut, square[k + 1 :]])
+        off = np.linalg.norm(quadrilateral(outline)[:, None] - square, axis=2).min(0)
+        assert off.max() < 2
+    assert quadrilateral(np.array([[0, 0], [60, 0], [80, 57], [30, 92], [-20, 57]])) is None  # no corner of a pentagon
+
+
+def true_corners(X_LV):
+    P = frames.apply(X_LV, Marker().corners())
+    return LENS.project(P[:, :2] / P[:, 2:])
+
+
+@pytest.mark.parametrize("what", ["shadow", "cover"])
+@pytest.mark.parametrize("z", [0.6, 1.2, 2.0])
+def test_marker_half_in_shadow_or_with_a_covered_corner_is_whole(what, z):
+    rng = np.random.default_rng(3)
+    for turn in (0.0, 1.1, 2.5):
+        X = facing(z, 0.3, -0.2, 0.4)
+        canvas = Canvas(LENS)
+        draw_bar(canvas, X, Marker())
+        if what == "shadow":
+            canvas.shade(frames.compose(X, frames.make(frames.rot_z(turn), np.zeros(3))), 0.5, 2.0)
+        else:
+            cover = frames.make(frames.rot_z(turn), np.array([0.049, -0.05, -0.001]))
+            canvas.rectangle(frames.compose(X, cover), METAL, (0.016, 0.016))
+        best = segment(canvas.finish(rng, 2.0, jpeg=95), CONFIG)[0][0]
+        assert not best.rejected
+        off = np.linalg.norm(best.corners[:, None] - true_corners(X), axis=2).min(0)
+        assert off.max() < 2 + 0.02 * 105 / z
+
+
+def test_diagonals_meet_in_the_image_of_the_centre():
+    X = facing(0.4, 0.7, 0.2, 0.3)
+    P = frames.apply(X, Marker().corners())
+    np.testing.assert_allclose(middle(P[:, :2] / P[:, 2:]), X[:2, 3] / X[2, 3], atol=1e-12)
 
 
 def test_real_photographs_red_square_found_in_both_cameras():

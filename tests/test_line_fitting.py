@@ -3,17 +3,19 @@
 import dataclasses as dc
 import pathlib
 
+import cv2
 import numpy as np
 import pytest
 from drawn_scene import PLATE, RED, Drawing, draw_valve, facing
 from helpers import Rig, ports, same
 
 from valve_drake import frames
+from valve_drake.analysis.drawn_images import Canvas, draw_bar
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError
 from valve_drake.messages import CameraFrame, Segmentation, SegmentationPair
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
-from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair, fit_quads, meet, side_lines
+from valve_drake.perception.line_fitting import LineFittingConfig, _even_light, fit_pair, fit_quads, meet, side_lines
 from valve_drake.perception.line_fitting_system import LineFittingSystem
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig
@@ -113,6 +115,39 @@ def test_something_across_a_side_is_left_out():
     assert abs(off[quad.side == 0].mean()) < 0.02
 
 
+@pytest.mark.parametrize("factor", [0.5, 0.7])
+def test_a_shadow_across_the_marker_moves_no_side(factor):
+    rng = np.random.default_rng(8)
+    for z, turn in ((0.6, 0.3), (1.0, 1.4), (1.6, 2.6), (2.0, -0.8)):
+        X = facing(z, 0.2, 0.3, 0.2)
+        canvas = Canvas(HEAD.left)
+        draw_bar(canvas, X, MARKER)
+        canvas.shade(frames.compose(X, frames.make(frames.rot_z(turn), np.zeros(3))), factor, 2.0)
+        quad = fit(canvas.finish(rng, 2.0), true_quad(X) + rng.uniform(-0.7, 0.7, (4, 2)))
+        assert quad.reason == ""
+        off = distances(quad, X)
+        assert np.sqrt(np.mean(off**2)) < 2 * quad.sigma
+        assert max(abs(off[quad.side == k].mean()) for k in range(4)) < 0.03
+
+
+def test_something_straight_across_the_marker_is_not_taken_for_a_shadow():
+    X = facing(0.8, 0.1, 0.1, 0.2)
+    canvas = Canvas(HEAD.left)
+    draw_bar(canvas, X, MARKER)
+    canvas.rectangle(frames.compose(X, frames.make(np.eye(3), np.array([0.06, 0, -0.01]))), (40, 42, 45), (0.06, 0.2))
+    mask = np.zeros((480, 640), np.uint8)
+    cv2.fillConvexPoly(mask, true_quad(X).round().astype(np.int32), 255)
+    image = canvas.finish(np.random.default_rng(0), 2.0).astype(np.float32)
+    assert _even_light(image, mask) is image
+    canvas = Canvas(HEAD.left)
+    draw_bar(canvas, X, MARKER)
+    canvas.shade(X, 0.3, 2.0)
+    image = canvas.finish(np.random.default_rng(0), 2.0).astype(np.float32)
+    even = _even_light(image, mask)
+    inside = cv2.erode(mask, np.ones((9, 9))) > 0
+    assert image[inside][:, 0].std() > 50 and even[inside][:, 0].std() < 8
+
+
 def test_gamma_of_an_ordinary_camera_is_undone():
     X = facing(0.8, 0.1, 0.1, 0.2)
     encoded = (255 * (quad_image(X, None, blur=1.2) / 255.0) ** (1 / 2.2)).round().astype(np.uint8)
@@ -178,6 +213,24 @@ def test_one_camera_alone_is_used_only_if_asked_for():
     assert not refused.left.found and refused.left.reason == "no candidate in the right image"
     used = fit_pair(pair, HEAD, MARKER, dc.replace(CONFIG, single_camera=True), matching)
     assert used.left.found and not used.right.found
+
+
+def test_a_camera_that_sees_no_sides_leaves_the_other_alone_only_if_asked_for():
+    pair = segmented(facing(1.2, 0.2, 0.1, 0.3), np.random.default_rng(6))
+    grey = CameraFrame(image=np.full((480, 640, 3), 120, np.uint8))
+    pair = dc.replace(pair, right=dc.replace(pair.right, frame=grey))
+    refused = fit_pair(pair, HEAD, MARKER, CONFIG, StereoPositioningConfig())
+    assert not refused.left.found and refused.left.reason == refused.right.reason == "contrast: 0"
+    used = fit_pair(pair, HEAD, MARKER, dc.replace(CONFIG, single_camera=True), StereoPositioningConfig())
+    assert used.left.found and not used.right.found
+
+
+def test_sides_of_another_length_are_refused_in_both_images():
+    pair = segmented(facing(1.2, 0.2, 0.1, 0.3), np.random.default_rng(6))
+    matching = StereoPositioningConfig(size_gate=1.0)
+    edges = fit_pair(pair, HEAD, Marker(size=[0.098, 0.13]), CONFIG, matching)
+    assert edges.left.reason.startswith("sides: ") and edges.left.reason == edges.right.reason
+    assert not edges.left.found and not edges.right.found
 
 
 def test_block():

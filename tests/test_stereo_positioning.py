@@ -21,6 +21,7 @@ from valve_drake.perception.stereo_positioning import (
     match,
     single,
     triangulate,
+    wrong_size,
 )
 from valve_drake.perception.stereo_positioning_system import StereoPositioningSystem
 
@@ -133,6 +134,43 @@ def test_two_to_one_marker_is_matched_whichever_way_it_hangs():
     for roll in (0.0, 0.8, 1.57, 3.0):
         pair = candidates_of((facing(2.0, 0.5, 0.3, roll), 0.12, 0.06))
         assert match(*pair, HEAD, marker, CONFIG).reason == ""
+
+
+def ideal(X, width, height, turn=0):
+    """Ideal corners of a rectangle in both cameras; the right one's counted from another corner."""
+    P = [frames.apply(frames.compose(X_CL, X), Marker(size=[width, height]).corners()) for _, X_CL in VIEWS]
+    left, right = (p[:, :2] / p[:, 2:] for p in P)
+    return left, np.roll(right, turn, axis=0)
+
+
+@pytest.mark.parametrize("z", [0.6, 1.2, 2.4])
+def test_a_long_box_that_one_camera_takes_for_the_slanted_marker_is_of_wrong_size(z):
+    rng = np.random.default_rng(1)
+    for pan in (0.6, 0.8):
+        for size in ((0.14, 0.04), (0.13, 0.06), (0.13, 0.13), (0.07, 0.07)):
+            corners = [c + rng.normal(0, 0.1 / 1075, (4, 2)) for c in ideal(facing(z, pan), *size, turn=1)]
+            assert wrong_size(*corners, HEAD, MARKER, CONFIG).startswith("sides: ")
+        for turn in range(4):
+            corners = [c + rng.normal(0, 0.1 / 1075, (4, 2)) for c in ideal(facing(z, pan), 0.098, 0.100, turn)]
+            assert wrong_size(*corners, HEAD, MARKER, CONFIG) == ""
+
+
+def test_an_oblong_marker_has_its_size_whichever_corner_comes_first():
+    left, right = ideal(facing(1.5, 0.4, 0.2, 0.3), 0.12, 0.08)
+    for turn in range(4):
+        assert wrong_size(np.roll(left, turn, axis=0), right, HEAD, Marker(size=[0.12, 0.08]), CONFIG) == ""
+
+
+def test_what_the_calibration_does_not_know_does_not_count_against_a_side():
+    corners = ideal(facing(1.5, 0.4), 0.12, 0.12)
+    assert wrong_size(*corners, HEAD, MARKER, CONFIG)
+    assert wrong_size(*corners, dc.replace(HEAD, rms_px=1.4), MARKER, CONFIG) == ""
+
+
+def test_rays_that_are_parallel_have_no_size():
+    corners = ideal(facing(2.0), 0.098, 0.100)[0]
+    parallel = dc.replace(HEAD, X_LR=frames.make(np.eye(3), HEAD.X_LR[:, 3]))
+    assert wrong_size(corners, corners, parallel, MARKER, CONFIG)
 
 
 def drawn_pair(X_LV, rng, sequence=0):

@@ -411,3 +411,4 @@ class SelectorReport(Message):
     limited: tuple[str, ...] = ()  # what was changed, e.g. "left_arm.velocity"
     refused: tuple[str, ...] = ()  # what was refused, e.g. "base: not finite"
     tripped: tuple[str, ...] = ()  # hands whose force was above the trip since this mode was entered
+    astray: tuple[str, ...] = ()  # groups that do not follow their command

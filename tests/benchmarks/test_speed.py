@@ -3,6 +3,8 @@
 python -m pytest tests/benchmarks
 """
 
+import time
+
 import cv2
 import numpy as np
 import pytest
@@ -31,11 +33,14 @@ def pose(z):
     return frames.make(R, np.array([0.06, 0.0, z]))
 
 
+def marker_images(z):
+    rng = np.random.default_rng(0)
+    return [canvas.finish(rng, 2.0, jpeg=95) for canvas in draw(pose(z), HEAD, MARKER, paint=draw_bar)]
+
+
 @pytest.mark.parametrize("z", DISTANCES)
 def test_stereo_pair_to_refined_pose(benchmark, z):
-    rng = np.random.default_rng(0)
-    left, right = (canvas.finish(rng, 2.0, jpeg=95) for canvas in draw(pose(z), HEAD, MARKER, paint=draw_bar))
-    found = benchmark(estimate_rectangle, left, right, HEAD)
+    found = benchmark(estimate_rectangle, *marker_images(z), HEAD)
     assert found.found and found.cameras == 2
     assert np.linalg.norm(found.X_LV[:, 3] - pose(z)[:, 3]) < 0.001 * z
     assert benchmark.stats.stats.median < 0.010
@@ -65,9 +70,8 @@ def tag_images(z):
     return out
 
 
-@pytest.mark.parametrize("z", DISTANCES)
-@pytest.mark.parametrize("corners", ["apriltag", "subpix"])
-def test_opencv_aruco_on_both_images(benchmark, corners, z):
+def tag_detection(corners, z):
+    """Detection and pose of the tag in both images, as a function to be timed."""
     settings = cv2.aruco.DetectorParameters()
     kinds = {"apriltag": cv2.aruco.CORNER_REFINE_APRILTAG, "subpix": cv2.aruco.CORNER_REFINE_SUBPIX}
     settings.cornerRefinementMethod = kinds[corners]
@@ -84,5 +88,30 @@ def test_opencv_aruco_on_both_images(benchmark, corners, z):
             out.append(cv2.solvePnP(model, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE))
         return out
 
-    left, _ = benchmark(work)
+    return work
+
+
+@pytest.mark.parametrize("z", DISTANCES)
+@pytest.mark.parametrize("corners", ["apriltag", "subpix"])
+def test_opencv_aruco_on_both_images(benchmark, corners, z):
+    left, _ = benchmark(tag_detection(corners, z))
     assert abs(np.linalg.norm(left[2]) - np.linalg.norm(pose(z)[:, 3])) < 0.02 * z
+
+
+@pytest.mark.parametrize("z", DISTANCES)
+def test_side_by_side_with_opencv(z, record_property):
+    """Taken in turns in one run, so that whatever else the machine does strikes all alike; processor time."""
+    images = marker_images(z)
+    works = {"refined": lambda: estimate_rectangle(*images, HEAD)}
+    works |= {corners: tag_detection(corners, z) for corners in ("subpix", "apriltag")}
+    taken = {name: [] for name in works}
+    for _ in range(15):
+        for name, work in works.items():
+            start = time.process_time()
+            work()
+            taken[name].append(1000 * (time.process_time() - start))
+    median = {name: float(np.median(values[2:])) for name, values in taken.items()}
+    for name, value in median.items():
+        record_property(f"{name} [ms]", round(value, 2))
+    print(f"{z} m:", *(f"{name} {value:.1f} ms" for name, value in median.items()))
+    assert median["apriltag"] > 5 * median["refined"]

@@ -2,8 +2,10 @@
 
 Every pixel is the integral of a scene of flat shapes, blurred by the lens, over the pixel's square. Along a straight
 edge at the signed distance d that integral has a closed form: the step, convolved with a Gaussian and with the two
-boxes that a square is to an edge of normal (n_u, n_v). A renderer's anti-aliasing counts a few samples in each
-pixel and shifts whole sides by 0.02 px, ten times what the estimator can tell; nothing here is sampled.
+boxes that a square is to an edge of normal (n_u, n_v). At a corner two edges meet; unless they are square to each
+other they depend on each other, as a bivariate normal distribution does, which is taken by its series. A renderer's
+anti-aliasing counts a few samples in each pixel and shifts whole sides by 0.02 px, ten times what the estimator can
+tell; nothing here is sampled.
 """
 
 import functools
@@ -69,9 +71,17 @@ class Canvas:
         box = box or self._box(P)
         if box is None or (P[:, 2] < _NEAR).any():
             return None
-        out = np.ones(self._xy[box].shape[:2])
-        for d, n_u in self._distances(P, box):
-            out *= np.interp(d, *_profile(n_u, self.blur))
+        sides = list(self._distances(P, box))
+        light = [np.interp(d, *_profile(n[0], self.blur)) for d, n in sides]
+        out = light[0] * light[1] * light[2] * light[3]
+        spread = math.hypot(self.blur, math.sqrt(1 / 12))  # of the blur and of the pixel
+        for i, j in enumerate(NEXT):
+            (a, n), (b, m) = sides[i], sides[j]
+            near = (np.abs(a) < 6 * spread) & (np.abs(b) < 6 * spread)
+            a, b, rho = a[near] / spread, b[near] / spread, n[0] * m[0] + n[1] * m[1]
+            tail = 1 + rho / 2 * a * b + rho**2 / 6 * (a * a - 1) * (b * b - 1)
+            joint = rho / (2 * math.pi) * np.exp(-(a * a + b * b) / 2) * tail
+            out[near] += joint * light[(i + 2) % 4][near] * light[(i + 3) % 4][near]
         return out, box
 
     def off_corners(
@@ -81,8 +91,8 @@ class Canvas:
         distances = [d for d, _ in self._distances(frames.apply(X_CS, _UNIT * [*half, 0]), box)]
         return np.sort(distances, axis=0)[1] > margin
 
-    def _distances(self, P: np.ndarray, box: tuple[slice, slice]) -> Iterator[tuple[np.ndarray, float]]:
-        """For each side of P (4, 3): the pixels' distance inside of it [px], and its normal's u at its middle."""
+    def _distances(self, P: np.ndarray, box: tuple[slice, slice]) -> Iterator[tuple[np.ndarray, tuple[float, float]]]:
+        """For each side of P (4, 3): the pixels' distance inside of it [px]; its unit normal (u, v) at its middle."""
         xy, A = self._xy[box], self._jacobian[box]
         q = P / P[:, 2:]
         turn = np.sign(np.cross(q[1] - q[0], q[2] - q[1])[2])
@@ -93,7 +103,8 @@ class Canvas:
             slope = np.hypot(g_u, g_v)
             # The lens turns the edge over the whole image only: one normal does for a side.
             near = np.abs(xy - (q[i, :2] + q[j, :2]) / 2).sum(-1).argmin()
-            yield (xy @ line[:2] + line[2]) / slope, round(float(g_u.flat[near] / slope.flat[near]), 4)
+            n_u, n_v = (round(float(g.flat[near] / slope.flat[near]), 4) for g in (g_u, g_v))
+            yield (xy @ line[:2] + line[2]) / slope, (n_u, n_v)
 
     def disc(self, X_CS: np.ndarray, color: tuple, half: tuple[float, float]) -> None:
         """An ellipse; its edge is nobody's measure, so the pixel's square counts as a little more blur."""

@@ -1,10 +1,11 @@
 """Finds what may be the red marker, and the green marks, in one image.
 
-Red is found by LOCAL contrast: Lab's a* against its mean over a small and a large neighbourhood, at half resolution.
-Absolute hues fail with the white balance; a mean over one neighbourhood alone fails on a marker larger than it.
-Every region is then cut out at full resolution on the linear opponent channel 2R - G - B, halfway between its
-inside and its surroundings, and judged by shape: a convex quadrilateral with even surroundings. Nothing is dropped
-silently: a candidate carries the reason for its rejection.
+Red, or green, is the share of that opponent channel (R - (G + B) / 2) in the brightness: a shadow's edge hardly
+changes it. It is searched by LOCAL contrast against its mean over a small and a large neighbourhood, at half
+resolution. Absolute hues fail with the white balance; a mean over one neighbourhood alone fails on a marker larger.
+Every region is then cut out, halfway between its inside and its surroundings, and judged by shape:
+a convex quadrilateral with even surroundings. Nothing is dropped silently: a candidate carries the reason for its
+rejection.
 """
 
 import dataclasses as dc
@@ -16,12 +17,16 @@ from valve_drake.checks import require, require_in
 from valve_drake.messages import MarkerCandidate, Mode
 from valve_drake.perception.marker import NEXT
 
-_RED = np.array([[2.0, -1.0, -1.0]], np.float32) / 4  # opponent channels of RGB; / 4 keeps them within int8
-_GREEN = np.array([[-1.0, 2.0, -1.0]], np.float32) / 4
+# Red, green and brightness of RGB; the offset stands for the noise that would else make colours of black.
+_MIX = np.array([[1, -0.5, -0.5, 0], [-0.5, 1, -0.5, 0], [1 / 3, 1 / 3, 1 / 3, 16]], np.float32)
+_COLORS = {"red": 0, "green": 1}
+_LARGE = 100  # a region of this size is cut out at half resolution [px]
+_SQUARE = np.ones((3, 3), np.uint8)
+_COARSE = 4  # neighbourhoods are averaged at this part of the half resolution
 
 
 _EVERY = {"search": 1, "measure": 1, "verify": 2}
-_EVERY |= {mode: 4 for mode in ("rough_approach", "fine_approach")}  # odometry is good for half a second
+_EVERY |= {"rough_approach": 4, "fine_approach": 2}  # odometry is good for half a second
 _EVERY |= {mode: 16 for mode in ("reach", "servo", "grasp", "turn", "release", "retreat")}  # for the log
 _EVERY |= {mode: 0 for mode in ("idle", "done", "failed", "stopped")}
 
@@ -36,8 +41,8 @@ def check_every(every: dict[str, int], key: str) -> None:
 
 @dc.dataclass
 class ColorSegmentationConfig:
-    min_contrast: float = 9.0  # of a* against the neighbourhood, to look closer [Lab units]
-    min_opponent: float = 12.0  # of 2R - G - B (a quarter of it) between inside and surroundings [grey levels]
+    min_contrast: float = 18.0  # of the colour's share against the neighbourhood, to look closer [%]
+    min_opponent: float = 24.0  # of R - (G + B) / 2 between inside and surroundings [grey levels]
     small_box: int = 61  # neighbourhoods whose mean is compared with [px of the full image]
     large_box: int = 301
     min_area: float = 60.0  # of a marker [px^2]
@@ -76,7 +81,7 @@ class Region:
     contour: np.ndarray  # (n, 2) of its outline, pixel centres [px]
     center: np.ndarray  # (2,) centroid [px]
     area: float  # [px^2]
-    contrast: float  # of the opponent channel, inside against surroundings [grey levels]
+    contrast: float  # of R - (G + B) / 2, or of G - (R + B) / 2, inside against surroundings [grey levels]
     evenness: float  # share of the ring round the region that is clearly not of its colour
 
 
@@ -89,32 +94,61 @@ def segment(
     """
     x, y, w, h = roi if roi else (0, 0, image.shape[1], image.shape[0])
     part = image[y : y + h, x : x + w]
-    a = _half_a(part)
-    regions, red = _regions(image, a, (x, y), config, "red")
+    shares = _half_shares(part)
+    regions, red = _regions(image, shares, (x, y), config, "red")
     red += [_judge(image, region, config) for region in regions]
     accepted = sorted((c for c in red if not c.rejected), key=lambda c: -c.score)
     rejected = sorted((c for c in red if c.rejected), key=lambda c: -c.area)
-    return (*accepted, *rejected), _green_marks(a, (x, y), config)
+    return (*accepted, *rejected), _green_marks(shares, (x, y), config)
 
 
 def green_regions(image: np.ndarray, config: ColorSegmentationConfig) -> list[Region]:
     """Green regions cut out at full resolution, for the wrist cameras."""
-    return _regions(image, _half_a(image), (0, 0), config, "green")[0]
+    return _regions(image, _half_shares(image), (0, 0), config, "green")[0]
 
 
 def quadrilateral(contour: np.ndarray) -> np.ndarray | None:
-    """The four corners that an outline (n, 2) simplifies to, clockwise as seen, or None -> (4, 2) [px]."""
+    """The four corners that an outline (n, 2) simplifies to, clockwise as seen, or None -> (4, 2) [px].
+
+    A corner that something covers is where the sides beside it would meet.
+    """
     hull = cv2.convexHull(contour.astype(np.int32).reshape(-1, 1, 2))
     length = cv2.arcLength(hull, True)
-    for share in (0.03, 0.045, 0.06, 0.08, 0.02):
+    for share in (0.02, 0.03, 0.045, 0.06, 0.08):
         corners = cv2.approxPolyDP(hull, share * length, True)[:, 0].astype(float)
+        if len(corners) == 5:
+            corners = _without_cut(corners)
         if len(corners) == 4:
             return corners if _signed_area(corners) > 0 else corners[::-1]
     return None
 
 
+def _without_cut(corners: np.ndarray) -> np.ndarray:
+    """A convex pentagon (5, 2) with that side removed whose neighbours then meet nearest, if they do so nearby."""
+    before, after = np.roll(corners, 1, 0), np.roll(corners, -2, 0)
+    end = np.roll(corners, -1, 0)
+    a, b, gap = corners - before, end - after, end - corners  # neighbours of side k, lengthened
+    turn = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    turn = np.where(np.abs(turn) < 1e-9, 1e-9, turn)
+    s = (gap[:, 0] * b[:, 1] - gap[:, 1] * b[:, 0]) / turn
+    t = (gap[:, 0] * a[:, 1] - gap[:, 1] * a[:, 0]) / turn
+    added = np.where((s > 0) & (t > 0), np.abs(s * t * turn), np.inf)  # twice the triangle's area
+    k = int(np.argmin(added))
+    if not added[k] < 0.2 * polygon_area(corners):
+        return corners
+    corners = corners.copy()
+    corners[k] += s[k] * a[k]
+    return np.delete(corners, (k + 1) % 5, 0)
+
+
 def polygon_area(corners: np.ndarray) -> float:
     return abs(_signed_area(corners))
+
+
+def middle(corners: np.ndarray) -> np.ndarray:
+    """Where the diagonals of a quadrilateral (4, 2) meet: the image of a rectangle's centre, (2,)."""
+    a, b, gap = corners[2] - corners[0], corners[3] - corners[1], corners[1] - corners[0]
+    return corners[0] + a * ((gap[0] * b[1] - gap[1] * b[0]) / (a[0] * b[1] - a[1] * b[0]))
 
 
 def _signed_area(p: np.ndarray) -> float:
@@ -123,28 +157,30 @@ def _signed_area(p: np.ndarray) -> float:
     return float(p[:, 0] @ q[:, 1] - p[:, 1] @ q[:, 0]) / 2
 
 
-def _half_a(image: np.ndarray) -> np.ndarray:
-    """a* of the image at half resolution, (H // 2, W // 2) uint8."""
+def _half_shares(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The shares of red and of green in the light [%], none below 0, at half resolution, (H // 2, W // 2) uint8."""
     small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(cv2.cvtColor(small, cv2.COLOR_RGB2LAB)[:, :, 1])
+    *colors, light = cv2.split(cv2.transform(small, _MIX))
+    red, green = (cv2.divide(color, light, scale=100) for color in colors)
+    return red, green
 
 
-def _contrast(a: np.ndarray, config: ColorSegmentationConfig, sign: int) -> np.ndarray:
-    """Largest excess of a* (sign > 0), or lack of it, over the means of both neighbourhoods; uint8.
+def _contrast(share: np.ndarray, config: ColorSegmentationConfig) -> np.ndarray:
+    """Largest excess of a colour's share over its means in both neighbourhoods; uint8.
 
-    Beyond the image's median a* the opposite colour does not count: grey beside red is not green.
+    Less of it than usual in the image does not count: grey beside green is not red under a warm light.
     """
-    counts = cv2.calcHist([a], [0], None, [256], [0, 256])[:, 0]
-    median = float(np.searchsorted(np.cumsum(counts), a.size / 2))
-    a = cv2.max(a, median) if sign > 0 else cv2.min(a, median)
-    out = None
+    size = share.shape[::-1]
+    small = cv2.resize(share, [max(n // _COARSE, 1) for n in size], interpolation=cv2.INTER_AREA)
+    counts = cv2.calcHist([small], [0], None, [256], [0, 256])[:, 0]
+    small = cv2.max(small, float(np.searchsorted(np.cumsum(counts), small.size / 2)))
+    means = []
     for box in (config.small_box, config.large_box):
         # A neighbourhood larger than the image would read past its reflection.
-        side = min((box // 2) | 1, 2 * min(a.shape) - 1)
-        mean = cv2.blur(a, (side, side), borderType=cv2.BORDER_REFLECT)
-        excess = cv2.subtract(a, mean) if sign > 0 else cv2.subtract(mean, a)
-        out = excess if out is None else cv2.max(out, excess)
-    return cv2.blur(out, (3, 3))
+        side = min((box // (2 * _COARSE)) | 1, 2 * min(small.shape) - 1)
+        means.append(cv2.blur(small, (side, side), borderType=cv2.BORDER_REFLECT))
+    mean = cv2.resize(cv2.min(*means), size, interpolation=cv2.INTER_LINEAR)
+    return cv2.blur(cv2.subtract(share, mean), (3, 3))
 
 
 def _outlines(mask: np.ndarray) -> list[np.ndarray]:
@@ -152,16 +188,20 @@ def _outlines(mask: np.ndarray) -> list[np.ndarray]:
 
 
 def _regions(
-    image: np.ndarray, a: np.ndarray, origin: tuple[int, int], config: ColorSegmentationConfig, color: str
+    image: np.ndarray,
+    shares: tuple[np.ndarray, np.ndarray],
+    origin: tuple[int, int],
+    config: ColorSegmentationConfig,
+    color: str,
 ) -> tuple[list[Region], list[MarkerCandidate]]:
     """Regions cut out at full resolution, and those that their coarse outline already rules out."""
-    contrast = _contrast(a, config, +1 if color == "red" else -1)
+    contrast = _contrast(shares[_COLORS[color]], config)
     seeds, ruled_out = [], []
     for outline in _outlines(cv2.compare(contrast, config.min_contrast, cv2.CMP_GT)):
         bx, by, bw, bh = cv2.boundingRect(outline)
         if bw * bh * 4 < config.min_area or min(bw, bh) < 2:
             continue
-        reason = _coarse_reason(outline, (bx, by, bw, bh), a.shape, config)
+        reason = _coarse_reason(outline, (bx, by, bw, bh), contrast.shape, config)
         if reason and color == "red":
             low = np.array([bx, by], float) * 2 + origin
             size = np.array([bw, bh], float) * 2
@@ -175,7 +215,7 @@ def _regions(
     for _, (bx, by, bw, bh) in seeds[: config.max_candidates]:
         box = (origin[0] + 2 * bx, origin[1] + 2 * by, 2 * bw, 2 * bh)
         local = contrast[by : by + bh, bx : bx + bw]
-        region = _cut_out(image, box, local, config, _RED if color == "red" else _GREEN)
+        region = _cut_out(image, box, local, _COLORS[color])
         if region is not None and not any(np.abs(region.center - r.center).max() < 1.5 for r in found):
             found.append(region)
     return found, ruled_out
@@ -200,36 +240,33 @@ def _coarse_reason(
     return ""
 
 
-def _cut_out(
-    image: np.ndarray,
-    box: tuple[int, int, int, int],
-    contrast: np.ndarray,
-    config: ColorSegmentationConfig,
-    opponent: np.ndarray,
-) -> Region | None:
-    """The region of a box at full resolution, on the linear opponent channel.
+def _cut_out(image: np.ndarray, box: tuple[int, int, int, int], contrast: np.ndarray, color: int) -> Region | None:
+    """The region of a box at full resolution, a large one at half of it.
 
     contrast: the half-resolution contrast within the box, whose upper half marks the region's inside.
     """
     x, y, w, h = box
-    pad = 4 + max(w, h) // 5
+    pad = 4 + 2 * (max(w, h) // 10)
     x0, y0 = max(x - pad, 0), max(y - pad, 0)
     x1, y1 = min(x + w + pad, image.shape[1]), min(y + h + pad, image.shape[0])
-    channel = cv2.transform(image[y0:y1, x0:x1].astype(np.float32), opponent)
+    step = 2 if max(w, h) > _LARGE else 1
+    # Not cut off at 0 here: what is green beside red counts.
+    planes = cv2.split(cv2.transform(image[y0:y1:step, x0:x1].astype(np.float32), _MIX))
+    opponent, light = (np.ascontiguousarray(plane[:, ::step]) for plane in (planes[color], planes[2]))
+    channel = cv2.divide(opponent, light, scale=100)
+    to_half = np.s_[:: 2 // step, :: 2 // step]  # where the levels are found
+    half = np.ascontiguousarray(channel[to_half])
     strong = cv2.compare(contrast, 0.6 * float(contrast.max()), cv2.CMP_GT)
-    inner = cv2.resize(strong, (w, h), interpolation=cv2.INTER_NEAREST)
-    inside = np.zeros(channel.shape, np.uint8)
-    # Odd image sizes leave the last row or column out of the half-size image.
-    ih, iw = min(h, inside.shape[0] - (y - y0)), min(w, inside.shape[1] - (x - x0))
-    inside[y - y0 : y - y0 + ih, x - x0 : x - x0 + iw] = inner[:ih, :iw]
-    around = cv2.bitwise_not(cv2.dilate(inside, np.ones((5, 5), np.uint8)))
-    around[2:-2, 2:-2] &= cv2.compare(channel[2:-2, 2:-2], cv2.mean(channel, inside)[0], cv2.CMP_LT)
-    high, low = cv2.mean(channel, inside)[0], cv2.mean(channel, around)[0]
-    if high - low < 0.5 * config.min_opponent:
-        return None
-    middle = (high + low) / 2
-    mask = cv2.compare(channel, middle, cv2.CMP_GT)
-    seed = _outline_with_most_of(mask, inside)
+    inside = np.zeros(half.shape, np.uint8)
+    v, u = (y - y0) // 2, (x - x0) // 2
+    inside[v : v + h // 2, u : u + w // 2] = strong[: inside.shape[0] - v, : inside.shape[1] - u]
+    around = cv2.bitwise_not(cv2.dilate(inside, _SQUARE))
+    high = cv2.mean(half, inside)[0]
+    around[1:-1, 1:-1] &= cv2.compare(half[1:-1, 1:-1], high, cv2.CMP_LT)
+    low = cv2.mean(half, around)[0]
+    halfway = (high + low) / 2
+    mask = cv2.compare(channel, halfway, cv2.CMP_GT)
+    seed = _outline_with_most_of(mask, inside, to_half)
     if seed is None:
         return None
     contour = seed[:, 0].astype(float)
@@ -239,38 +276,32 @@ def _cut_out(
     # The ring begins outside the blur of the edge.
     region = np.zeros(mask.shape, np.uint8)
     cv2.drawContours(region, [seed], -1, 255, -1)
-    near = cv2.dilate(region, np.ones((5, 5), np.uint8))
-    ring = cv2.subtract(cv2.dilate(near, np.ones((5, 5), np.uint8)), near)
+    near = cv2.dilate(region, _SQUARE, iterations=2 // step)
+    ring = cv2.subtract(cv2.dilate(near, _SQUARE, iterations=2 // step), near)
     ringed = cv2.countNonZero(ring)
-    clear = cv2.countNonZero(cv2.bitwise_and(ring, cv2.compare(channel, middle, cv2.CMP_LT)))
-    inside_mean = cv2.mean(channel, cv2.erode(region, np.ones((3, 3), np.uint8)) if area > 100 else region)[0]
-    ring_mean = cv2.mean(channel, ring)[0]
+    clear = cv2.countNonZero(cv2.bitwise_and(ring, cv2.compare(channel, halfway, cv2.CMP_LT)))
+    core = cv2.erode(region, _SQUARE) if area > 100 else region
     offset = np.array([x0, y0], float)
     return Region(
-        contour=contour + offset,
-        center=center + offset,
-        area=float(area),
-        contrast=float(inside_mean - ring_mean),
+        contour=step * contour + offset,
+        center=step * center + offset,
+        area=float(area) * step**2,
+        contrast=cv2.mean(opponent, core)[0] - cv2.mean(opponent, ring)[0],
         evenness=clear / ringed if ringed else 0.0,
     )
 
 
-def _outline_with_most_of(mask: np.ndarray, inside: np.ndarray) -> np.ndarray | None:
-    """Of the outlines in `mask`, the one whose filled area holds most of `inside`."""
-    outlines = _outlines(mask)
-    if not outlines:
-        return None
-    if len(outlines) == 1:
-        return outlines[0]
-    best, most = None, 0.0
-    for outline in sorted(outlines, key=cv2.contourArea, reverse=True)[:3]:
-        x, y, w, h = cv2.boundingRect(outline)
-        filled = np.zeros((h, w), np.uint8)
-        cv2.drawContours(filled, [outline], -1, 255, -1, offset=(-x, -y))
-        held = cv2.countNonZero(cv2.bitwise_and(filled, inside[y : y + h, x : x + w]))
-        if held > most:
-            best, most = outline, held
-    return best
+def _outline_with_most_of(mask: np.ndarray, inside: np.ndarray, part: tuple[slice, slice]) -> np.ndarray | None:
+    """Of the outlines in `mask`, the one whose filled area holds most of `inside`, a mask of `part` of its pixels."""
+    outlines = sorted(_outlines(mask), key=cv2.contourArea, reverse=True)[:3]
+    held = []
+    for outline in outlines if len(outlines) > 1 else ():
+        filled = np.zeros(mask.shape, np.uint8)
+        cv2.drawContours(filled, [outline], -1, 255, -1)
+        held.append(cv2.countNonZero(cv2.bitwise_and(np.ascontiguousarray(filled[part]), inside)))
+    if held:
+        return outlines[int(np.argmax(held))] if max(held) else None
+    return outlines[0] if outlines else None
 
 
 def _judge(image: np.ndarray, region: Region, config: ColorSegmentationConfig) -> MarkerCandidate:
@@ -304,15 +335,17 @@ def _judge(image: np.ndarray, region: Region, config: ColorSegmentationConfig) -
         elif max(abs(sides[0] - sides[2]), abs(sides[1] - sides[3])) > 0.35 * long / 2 + 3:
             rejected = "sides: opposite ones differ"
         else:
-            score = fill * region.evenness * min(region.contrast / 60, 1.0) * float(np.sqrt(region.area))
+            score = fill * region.evenness * min(region.contrast / 120, 1.0) * float(np.sqrt(region.area))
     if corners is None:
         corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     return MarkerCandidate(corners=corners, center=region.center, area=region.area, score=score, rejected=rejected)
 
 
-def _green_marks(a: np.ndarray, origin: tuple[int, int], config: ColorSegmentationConfig) -> np.ndarray:
-    """Centres of small green regions, weighted by contrast, from the half-resolution a*; (n, 3)."""
-    contrast = _contrast(a, config, -1)
+def _green_marks(
+    shares: tuple[np.ndarray, np.ndarray], origin: tuple[int, int], config: ColorSegmentationConfig
+) -> np.ndarray:
+    """Centres of small green regions, weighted by contrast, from the half-resolution shares; (n, 3)."""
+    contrast = _contrast(shares[_COLORS["green"]], config)
     marks = []
     for outline in _outlines(cv2.compare(contrast, config.min_contrast, cv2.CMP_GT)):
         x, y, w, h = cv2.boundingRect(outline)

@@ -15,6 +15,7 @@ from valve_drake.perception.color_segmentation import (
     Region,
     check_every,
     green_regions,
+    middle,
     polygon_area,
     quadrilateral,
 )
@@ -28,7 +29,7 @@ class HandleMarkerConfig:
     segmentation: ColorSegmentationConfig = dc.field(
         default_factory=lambda: ColorSegmentationConfig(small_box=181, large_box=561, min_area=150, max_candidates=6)
     )
-    lines: LineFittingConfig = dc.field(default_factory=lambda: LineFittingConfig(color_only=True))
+    lines: LineFittingConfig = dc.field(default_factory=lambda: LineFittingConfig(color_only=True, reach=0.12))
     border: int = 3  # a mark this near to the image's border is cut off [px]
     min_fill: float = 0.85  # region's area over its quadrilateral's, and the inverse
     max_aspect: float = 4.0  # long side over short side in the image
@@ -95,9 +96,7 @@ def _judge(image: np.ndarray, region: Region, config: HandleMarkerConfig) -> Han
     area = polygon_area(fitted)
     if not np.isfinite(fitted).all() or not 0.7 < area / region.area < 1.4:
         return HandleMark(reason="sides do not meet")
-    c = np.column_stack([fitted, np.ones(4)])
-    center = np.cross(np.cross(c[0], c[2]), np.cross(c[1], c[3]))  # the diagonals' meeting point
-    center = center[:2] / center[2]
+    center = middle(fitted)
     return HandleMark(
         found=True, center=center, area=area, corners=fitted, feature=np.append(center, 1.0) / np.sqrt(area)
     )

@@ -1,13 +1,16 @@
 """The four sides of a coloured quadrilateral to a few hundredths of a pixel.
 
-1. The image is mixed to ONE linear channel: the direction in RGB that separates inside from outside best.
-2. Hough lines through its edge pixels give the four coarse lines (section 4 of the paper).
+1. The image is mixed to ONE linear channel: the direction in RGB that separates inside from outside best. The light on
+   either side of a shadow's edge across the marker is evened first.
+2. Hough lines through its edge pixels give the four coarse lines (section 4 of the paper), and the mean of the pixels
+   along each a better one: what is fitted next then needs fewer steps, and ends at the same place from any start.
 3. Every image column (or row, for an upright side) that crosses a side is one short profile of untouched pixels. A
    blurred step, b + A Phi(d / s) of the distance d from the side, is fitted to all of them together: levels (with a
    linear trend along the side), blur s, and the side as a smooth curve. One Gauss-Newton step per profile from there
    gives that profile's own edge point. No pixel is interpolated or used twice, so the points' errors are
    independent, but for the side's levels, whose share is counted in sigma.
-4. Points (never images) are undistorted; the straight line through them is judged, and lines meet in the corners.
+4. Where light allows it, all four sides are fitted once more together, up to the corners (joint_fit.py).
+5. Points (never images) are undistorted; the straight line through them is judged, and lines meet in the corners.
 """
 
 import dataclasses as dc
@@ -19,21 +22,26 @@ from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require_in
 from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, SegmentationPair
 from valve_drake.perception.color_segmentation import polygon_area
+from valve_drake.perception.joint_fit import Curves, basis, joint_fit, meet, normal_cdf, sums
 from valve_drake.perception.marker import NEXT, Marker
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig, match, single
+from valve_drake.perception.stereo_positioning import StereoPositioningConfig, match, single, wrong_size
 
-_BEFORE = [3, 0, 1, 2]
 # Of the six functions 1, tau, rise, tau rise, bell, tau bell: the index of each product, and its power of tau.
 _PRODUCT = np.repeat(np.repeat([[0, 1, 2], [1, 3, 4], [2, 4, 5]], 2, axis=0), 2, axis=1)
 _TAU_POWER = np.tile([[0, 1], [1, 2]], (3, 3))
 _REACH = 4.5  # half a profile's length that holds a blurred step [blur]
 _PAD = 12  # least room round the quadrilateral [px]
+_LARGE = 100  # of a quadrilateral of this size coarse lines are looked for at half resolution [px]
+_EVEN = 0.1  # deviation over mean of the marker's inside above which a shadow is looked for
+_ONE_HUE = 0.96  # least cosine between the marker's colour in the shadow and in the light
+_TWO_LEVELS = 0.25  # share of that variance which two lights leave unexplained at most
 _PRIOR_POINTS = 20  # how many points the noise predicted from the grey values counts for, against the scatter seen
 
 
 @dc.dataclass
 class LineFittingConfig:
-    half_window: int = 8  # of a profile [px]; smaller on small quadrilaterals and towards the corners
+    half_window: int = 8  # of a profile [px]; shorter on small quadrilaterals and towards the corners
+    reach: float = 0.15  # of half a profile over the quadrilateral's width, at most; the surroundings are plain there
     trim: float = 2.5  # of a side at each corner, beyond the profile's reach [px]
     gamma: float = 1.0  # light = value^gamma; 1 if pixel values are linear in light, 2.2 for ordinary cameras
     iterations: int = 5
@@ -41,11 +49,12 @@ class LineFittingConfig:
     min_contrast: float = 10.0  # between inside and outside [grey levels, over all channels]
     min_share: float = 0.5  # of a side's profiles that must fit
     color_only: bool = False  # compare colours and not brightness: for a mark whose surroundings are bright and dark
-    single_camera: bool = False  # take the best candidate of one camera if the two agree on none
+    single_camera: bool = False  # one camera is enough if the other sees no marker, or no sides of it
 
     def check(self) -> None:
         for name, low, high in (
             ("half_window", 3, 20),
+            ("reach", 0.02, 0.5),
             ("trim", 0, 20),
             ("gamma", 0.3, 4),
             ("iterations", 2, 20),
@@ -64,6 +73,8 @@ class RawQuad:
     side: np.ndarray = dc.field(default_factory=lambda: np.zeros(0, int))  # (n,) 0..3
     sigma: float = 0.0  # of a point along the side's normal [px]
     blur: float = 0.0  # standard deviation of the edge's spread [px]
+    together: np.ndarray | None = None  # (4, n, 2) points on the sides, from the fit of all four together [px]
+    information: np.ndarray | None = None  # (8, 8) of the sides so fitted, see QuadEdges [1/px^2]
     reason: str = ""
 
 
@@ -90,6 +101,13 @@ def fit_pair(
     for k, candidate, one in zip(used, candidates, raw):
         seen, lens = cameras[k]
         quads[k] = _edges_of(one, candidate, seen.green, lens, config.max_sigma)
+    reason = ""
+    if quads[0].found and quads[1].found:
+        reason = wrong_size(quads[0].corners, quads[1].corners, head, marker, matching)
+    elif len(used) == 2 and not config.single_camera:  # one camera alone takes many things for the marker
+        reason = quads[0].reason or quads[1].reason
+    if reason:
+        quads = [quad if quad.reason else QuadEdges(reason=reason, center_px=quad.center_px) for quad in quads]
     return MarkerEdges(time=pair.time, sequence=pair.sequence, left=quads[0], right=quads[1])
 
 
@@ -101,6 +119,9 @@ def _edges_of(
         return QuadEdges(reason=raw.reason, center_px=candidate.center)
     points = lens.normalize(raw.points)
     lines, scatter = side_lines(points, raw.side)
+    if raw.together is not None:
+        n = raw.together.shape[1]
+        lines = side_lines(lens.normalize(raw.together.reshape(-1, 2)), np.repeat(np.arange(4), n))[0]
     corners = meet(lines)
     if not np.isfinite(corners).all():
         return QuadEdges(reason="sides do not meet", center_px=candidate.center)
@@ -113,6 +134,7 @@ def _edges_of(
         sigma=raw.sigma,
         corners=corners,
         corners_px=lens.project(corners),
+        information=np.zeros((8, 8)) if raw.information is None else raw.information,
         center_px=candidate.center,
         green=lens.normalize(green[:, :2]) if len(green) else green[:, :2],
     )
@@ -149,7 +171,8 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: LineF
                 wide = _place(sides.channel, coarse, config, _REACH * raw.blur)
                 if not isinstance(wide, str) and wide.half > sides.half:
                     raw = _fit_sides([wide], config)[0]
-            out[k] = raw if raw.reason else dc.replace(raw, points=raw.points + low)
+            together = None if raw.together is None else raw.together + low
+            out[k] = raw if raw.reason else dc.replace(raw, points=raw.points + low, together=together)
     return out
 
 
@@ -172,16 +195,6 @@ def side_lines(points: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]
     return lines, float(np.sqrt((distance @ distance) / max(len(s) - 8, 1)))
 
 
-def meet(lines: np.ndarray) -> np.ndarray:
-    """Corners (4, 2) of four sides (4, 3): corner k is where sides k - 1 and k meet."""
-    a, b = lines[_BEFORE], lines
-    w = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    x = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
-    y = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.stack([x, y], -1) / w[:, None]
-
-
 def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tuple[np.ndarray, float]:
     """One linear channel, float32: about 1 inside, about 0 outside; and the contrast it has [grey levels]."""
     if config.gamma != 1.0:
@@ -196,7 +209,9 @@ def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tu
         shape = ((middle + factor * (corners - middle)) * 16).round().astype(np.int32)
         return cv2.fillConvexPoly(mask, shape, 255, shift=4)
 
-    core = np.array(cv2.mean(part, grown(0.75))[:3])
+    inside = grown(0.75)
+    part = _even_light(part, inside)
+    core = np.array(cv2.mean(part, inside)[:3])
     ring = np.array(cv2.mean(part, cv2.subtract(grown(1.3), grown(1.14)))[:3])
     difference = core - ring
     if config.color_only:
@@ -208,8 +223,58 @@ def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tu
     return cv2.transform(part, np.array([[*w, -w @ ring]], np.float32)), contrast
 
 
+def _even_light(part: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """The image (H, W, 3) float32 as if all of it were in the light, if a shadow's edge crosses the marker.
+
+    inside: mask of the marker's inside. It is of one colour, so two levels on either side of a straight edge are two
+    lights. The edge is taken to go on straight beyond the marker.
+    """
+    mean, deviation = (x.ravel() for x in cv2.meanStdDev(part, mask=inside))
+    if deviation.max() < _EVEN * mean.max():
+        return part
+    v, u = np.nonzero(inside)
+    colors = part[v, u].astype(float)
+    y = colors @ deviation / deviation.sum()
+    middle, size = np.array([u.mean(), v.mean()]), float(np.hypot(u.std(), v.std()))
+    form = np.column_stack([(u - middle[0]) / size, (v - middle[1]) / size, np.ones(len(u))])
+    # y = a + b tanh(form . edge). Start: a soft edge half way between the light pixels and the dark ones.
+    light = y > (y.max() + y.min()) / 2
+    bright, dark = form[light].mean(0)[:2], form[~light].mean(0)[:2]
+    way = (bright - dark) / max(float((bright - dark) @ (bright - dark)), 1e-9)
+    x = np.array([*(3 * way), -3 * way @ (bright + dark) / 2, y.mean(), y.std()])
+    damping, square = 1e-2, np.inf
+    for _ in range(25):
+        s = np.tanh(form @ x[:3])
+        left = y - x[3] - x[4] * s
+        if left @ left < square:
+            if left @ left > 0.9999 * square:
+                break
+            square, best, damping = left @ left, x, damping / 5
+            J = np.column_stack([x[4] * (1 - s * s)[:, None] * form, form[:, 2], s])
+            H, g = J.T @ J, J.T @ left
+        else:
+            damping *= 10
+        x = best + np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), g)
+    if square > _TWO_LEVELS * len(y) * y.var():
+        return part
+    levels = np.linalg.lstsq(np.column_stack([form[:, 2], np.tanh(form @ best[:3])]), colors, rcond=None)[0]
+    one, other = levels[0] + levels[1], levels[0] - levels[1]
+    if one @ other < _ONE_HUE * np.linalg.norm(one) * np.linalg.norm(other):
+        return part  # something lies before the marker
+    rows, columns = (np.arange(n)[shape] for n, shape in zip(part.shape, ((..., None), (None, ...))))
+    s = np.tanh(((columns - middle[0]) * best[0] + (rows - middle[1]) * best[1]) / size + best[2])
+    lit = np.maximum(one, other)
+    return (part / np.clip((levels[0] + levels[1] * s[..., None]) / lit, 0.1, 1)).astype(np.float32)
+
+
 def _hough_corners(channel: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Corners from the strongest Hough lines near the four sides; a side without one keeps its coarse line."""
+    """Corners from the strongest Hough lines near the four sides, each moved to the mean of the edge pixels by it.
+
+    A side without such a line (a wide-angle lens bends long ones) starts from its coarse one.
+    """
+    step = 2 if np.ptp(corners, axis=0).max() > _LARGE else 1
+    coarse, channel = corners, np.ascontiguousarray(channel[::step, ::step])
+    corners = corners / step
     gray = cv2.convertScaleAbs(cv2.max(cv2.min(channel, 1.0), 0.0), alpha=255)
     edges = cv2.Canny(gray, 60, 120)
     band = np.zeros(edges.shape, np.uint8)
@@ -217,22 +282,32 @@ def _hough_corners(channel: np.ndarray, corners: np.ndarray) -> np.ndarray:
     ends = corners[NEXT]
     lengths = np.linalg.norm(ends - corners, axis=1)
     votes = max(int(0.35 * lengths.min()), 4)
-    found = cv2.HoughLines(cv2.bitwise_and(edges, band), 1.0, np.pi / 180, votes)
+    turn = np.clip(2 / lengths.max(), np.pi / 180, np.pi / 90)  # a pixel at the ends of a side
+    edges = cv2.bitwise_and(edges, band)
+    found = cv2.HoughLines(edges, 1.0, turn, votes)
     direction = (ends - corners) / lengths[:, None]
     lines = np.column_stack([-direction[:, 1], direction[:, 0], np.zeros(4)])
     lines[:, 2] = -(lines[:, :2] * corners).sum(1)
+    reach = np.full(4, 3.5)
     if found is not None:
-        rho, theta = found[:200, 0].astype(float).T
+        rho, theta = found[:, 0].astype(float).T
         normals = np.column_stack([np.cos(theta), np.sin(theta)])
-        for k in range(4):
-            turned = np.abs(normals @ direction[k])
-            off = np.abs(normals @ ((corners[k] + ends[k]) / 2) - rho)
-            near = np.flatnonzero((turned < 0.2 + 2 / lengths[k]) & (off < 3.0))
-            if len(near):  # the most votes come first
-                lines[k] = [*normals[near[0]], -rho[near[0]]]
-    refined = meet(lines)
-    ok = np.isfinite(refined).all() and np.abs(refined - corners).max() < 4 + 0.05 * lengths.max()
-    return refined if ok else corners
+        turned = np.abs(normals @ direction.T)  # (lines, 4)
+        off = np.abs(normals @ ((corners + ends) / 2).T - rho[:, None])
+        near = (turned < 0.2 + 2 / lengths) & (off < 3.0)
+        best, seen = near.argmax(0), near.any(0)  # the most votes come first
+        lines[seen], reach[seen] = np.column_stack([normals, -rho])[best[seen]], 2.0
+    pixels = cv2.findNonZero(edges)
+    if pixels is None:
+        return coarse
+    pixels = pixels[:, 0].astype(float)
+    off = np.abs(pixels @ lines[:, :2].T + lines[:, 2])
+    side = off.argmin(1)
+    by = off[np.arange(len(off)), side] < reach[side]
+    lines = side_lines(pixels[by], side[by])[0]
+    refined = step * meet(lines)
+    ok = np.isfinite(refined).all() and np.abs(refined - coarse).max() < 4 + 0.05 * step * lengths.max()
+    return refined if ok else coarse
 
 
 @dc.dataclass(frozen=True)
@@ -251,9 +326,7 @@ class _Sides:
     lean: np.ndarray  # pixels along t that a profile needs for one more pixel of its half
 
 
-def _place(
-    channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig, least: float = 0.0
-) -> _Sides | str:
+def _place(channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig, least: float = 0.0) -> _Sides | str:
     """Lays the profiles across the sides of a coarse quadrilateral; or why it cannot.
 
     least: half a profile's length that blur calls for, if the opposite side is far enough [px].
@@ -270,9 +343,9 @@ def _place(
     cosine = 1 / np.sqrt(1 + slope**2)
     # A profile must reach neither the opposite side nor the rim of the light plate round the marker.
     width = polygon_area(corners) / lengths.max()
-    half = int(max(np.clip(round(0.12 * width), 3, config.half_window), min(least, 0.3 * width)))
+    half = int(max(np.clip(round(config.reach * width), 3, config.half_window), min(least, 0.3 * width)))
     # The light plate is narrowest at the corners: profiles are short there, and grow with the distance from them.
-    least_half = min(half, 3)
+    least_half = min(half, 2)
     reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 3.0)) + least_half * np.abs(slope) * cosine
     begin = np.minimum(corners[four, t_axis], ends[four, t_axis]) + reach * cosine
     stop = np.maximum(corners[four, t_axis], ends[four, t_axis]) - reach * cosine
@@ -283,7 +356,7 @@ def _place(
         return f"side {int(np.argmin(count))} short"
     start = corners[four, 1 - t_axis] - slope * corners[four, t_axis]
     inward = np.sign(corners.mean(0)[1 - t_axis] - (corners + ends)[four, 1 - t_axis] / 2)
-    lean = np.maximum(np.abs(slope) * cosine**2, 1.5)
+    lean = np.maximum(np.abs(slope) * cosine**2, 2.5)
     return _Sides(channel, flat, first, count, start, slope, inward, half, np.full(4, half - least_half), lean)
 
 
@@ -306,27 +379,30 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
     from_end = np.minimum(k, count[:, None] - 1 - k)
     room = half[:, None] - np.maximum(spare[:, None] - from_end / np.maximum(lean, 1e-3)[:, None], 0)
     room = (np.minimum(room, half[:, None]) + 1).astype(np.float32)[:, :, None]  # (S, N, 1)
-    curve = start[:, None] + slope[:, None] * t
+    line = start[:, None] + slope[:, None] * t
     reach = int(half.max()) + 2
-    y = np.rint(curve)[:, :, None] + np.arange(-reach, reach + 1)  # (S, N, M)
+    y = np.rint(line)[:, :, None] + np.arange(-reach, reach + 1)  # (S, N, M)
     columns = flat[:, None, None]
     in_image = (y >= 0) & (y < np.where(columns, tall, wide))
     yi = np.where(in_image, y, 0).astype(int)
     ti = np.minimum(t[:, :, None], np.where(columns, wide, tall) - 1)
     f = pixels[origin + np.where(columns, yi * wide + ti, ti * wide + yi)]  # float32, as all that is per pixel
 
-    basis = np.stack([np.ones_like(tau), tau, tau**2 - 1 / 3], -1)  # (S, N, 3)
+    powers = basis(tau)  # (S, N, 3)
+    coefficient = np.zeros((len(count), 3))  # of the sides' deviation from their first straight lines
     bend = np.where(count >= 24, 1e-9, 1e9)  # short sides show no curvature of the lens
     valid = (used[:, :, None] * in_image).astype(np.float32)
     good, blur, last = used, np.full(len(count), 1.0), False
     has_step = np.full(len(count), True)
-    for step in range(config.iterations):
+    for iteration in range(config.iterations):
+        curve = line + (powers @ coefficient[:, :, None])[:, :, 0]
         offset = (y - curve[:, :, None]).astype(np.float32)
         # No pixel enters or leaves at once.
         weight = valid * np.clip(room - np.abs(offset), 0, 1)
+        width = blur  # that this step is linear about
         z = (inward * cosine / blur).astype(np.float32)[:, None, None] * offset
         bell = np.exp(-0.5 * z * z) * np.float32(1 / np.sqrt(2 * np.pi))
-        rise = _normal_cdf(z, bell)
+        rise = normal_cdf(z, bell)
         level, kept = _levels(weight, good, rise, bell, f, tau)
         has_step &= level[:, 2] >= 0.3
         base = (level[:, 0:1] + level[:, 1:2] * tau).astype(np.float32)
@@ -346,13 +422,16 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         good = used * (square < 6 * typical[:, None] + 4e-4) * (strength > 0.2 * strength.max(1, keepdims=True))
         moved = (inward / cosine)[:, None] * np.clip(shift, -1.5, 1.5)
         rounds = 2 if last else 1  # outliers are looked for once the model is near
-        smooth, good = _smooth(basis, moved, good, bend, np.sqrt(typical[:, None] / strength), rounds)
+        step, good = _smooth(powers, moved, good, bend, np.sqrt(typical[:, None] / strength), rounds)
+        smooth = (powers @ step[:, :, None])[:, :, 0]
         if last:
             break
-        curve = curve + smooth
+        coefficient = coefficient + step
         settled = np.abs(used * smooth).max() < 0.2 and np.abs(change).max() < 0.05  # the next step is the square of it
-        last = settled or step == config.iterations - 2
+        last = settled or iteration == config.iterations - 2
     edge = curve + moved
+    curves = Curves(flat, inward, first, count, start, slope, coefficient)
+    seen = sums(weight, good, rise, gain, z, residual, tau)
     points = np.where(columns, np.stack([t, edge], -1), np.stack([edge, t], -1))
     deviation = good * ((moved - smooth) * cosine[:, None]) ** 2
     predicted = good * typical[:, None] / strength
@@ -378,7 +457,19 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
             out.append(RawQuad(reason=reason))
             continue
         side = np.broadcast_to(np.arange(4)[:, None], keep.shape)[keep]
-        out.append(RawQuad(points=points[own][keep], side=side, sigma=float(sigma), blur=float(blur[4 * q])))
+        scatter = float((deviation * strength)[own].sum()), float(freedom)
+        shared = joint_fit(quads[q].channel, curves[own], level[own], width[4 * q], seen[own], bend[own], scatter)
+        together, information = shared or (None, None)
+        out.append(
+            RawQuad(
+                points=points[own][keep],
+                side=side,
+                sigma=float(sigma),
+                blur=float(blur[4 * q]),
+                together=together,
+                information=information,
+            )
+        )
     return out
 
 
@@ -422,7 +513,7 @@ def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:
 def _smooth(
     basis: np.ndarray, moved: np.ndarray, good: np.ndarray, bend: np.ndarray, noise: np.ndarray, rounds: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Robust curve through the profiles' shifts (S, N): its values, and which profiles belong to it."""
+    """Robust curve through the profiles' shifts (S, N): its coefficients, and which profiles belong to it."""
     prior = np.zeros((len(bend), 3, 3))
     prior[:, [0, 1], [0, 1]] = 1e-9
     prior[:, 2, 2] = bend
@@ -433,13 +524,4 @@ def _smooth(
         off = np.abs(moved - value)
         spread = 1.48 * _median(off, good)[:, None]
         good = good * (off < 4 * np.maximum(noise, spread) + 0.02)
-    return value, good
-
-
-def _normal_cdf(z: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """Phi(z) given its density (Abramowitz and Stegun 26.2.17, error < 8e-8)."""
-    a = np.abs(z)
-    u = 1 / (1 + 0.2316419 * a)
-    poly = u * (0.319381530 + u * (-0.356563782 + u * (1.781477937 + u * (-1.821255978 + u * 1.330274429))))
-    tail = density * poly
-    return np.where(z >= 0, 1 - tail, tail)
+    return c[:, :, 0], good

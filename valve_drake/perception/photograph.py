@@ -53,7 +53,7 @@ def look(
     marker = Marker(size=list(size), handle_radius=max(0.15, max(size)))
     coloring = ColorSegmentationConfig(min_fill=0.78)  # blurred colours round the corners off
     lines = LineFittingConfig(max_sigma=1.5, single_camera=len(images) == 1)
-    matching = StereoPositioningConfig(epipolar_gate=4.0 + slack, size_gate=0.3)
+    matching = StereoPositioningConfig(epipolar_gate=4.0 + slack, size_gate=0.3, side_gate=0.3)
     fitting = RectangleEstimatorConfig(
         method=method, yaw_sigma=slack / head.right.focal(), max_residual=1.2, size_gate=0.2, min_distance=0.1
     )

@@ -4,13 +4,14 @@
           the two parallel to Y, the rough position from all four, then the fine step through the area. The four
           sides' directions are vanishing points, which a small rectangle hardly shows: 10 to 20 times the error of
           the bound at 1 to 2 m. Its printed fine step is biased, see `fine_step`.
-`refined` All edge points of one or two cameras are fitted to the known rectangle by least squares,
+`refined` The sides seen by one or two cameras are fitted to the known rectangle by least squares,
 
               r = w l(X) . (x', y', 1),   l = h / |h_xy|,   h = P_i x P_j   (P_i, P_j: the side's corners in the camera)
 
-          with the analytic Jacobian, robust weights, both mirror images of the tilt, and the 6x6 covariance. Since
-          r is linear in l, a side's points act only through their moments: each side is three numbers, however
-          many points it has, and a Gauss-Newton step costs the same at every distance.
+          with the analytic Jacobian, both mirror images of the tilt, and the 6x6 covariance. (x', y') are two points
+          on each side with their joint information (perception/joint_fit.py), or, where there is none, all edge
+          points with robust weights. Since r is linear in l, they act only through their moments: each side is two
+          or three numbers, however many points it has, and a Gauss-Newton step costs the same at every distance.
 
 Frames: L left head camera, V marker. Side k joins corner k and k + 1, clockwise as seen (perception/marker.py).
 Which side is which is settled last: green marks, else sizes, else the track, else n_x > 0 (`_settle_axis`).
@@ -26,12 +27,14 @@ from valve_drake import frames
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require, require_in
 from valve_drake.messages import MarkerEdges, QuadEdges, RectangleEstimate
+from valve_drake.perception.joint_fit import NODES
 from valve_drake.perception.line_fitting import meet, side_lines
 from valve_drake.perception.marker import NEXT, Marker
 
 METHODS = ("refined", "paper")
-_HOPELESS = 1000.0  # chi^2 above the best from which no start is refined
+_HOPELESS = 1000.0  # chi^2 above the best from which no further start is refined
 _SHORT_SIDE = 40.0  # blur and surroundings bias shorter sides more [px]
+_FOUR = np.arange(4)
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 _SKEW = np.zeros((3, 9))  # v @ _SKEW is [v]x row by row
 _SKEW[0, [7, 5]], _SKEW[1, [2, 6]], _SKEW[2, [3, 1]] = (1, -1), (1, -1), (1, -1)
@@ -58,7 +61,7 @@ class RectangleEstimatorConfig:
     size_gate: float = 0.1  # difference of distance by triangulation and by the fit that is allowed [relative]
     min_distance: float = 0.25  # [m]
     max_distance: float = 6.0  # [m]
-    max_tilt: float = 1.31  # of the marker against the line of sight [rad]
+    max_tilt: float = 1.13  # of the marker against the line of sight [rad]
     max_iterations: int = 15
     track_timeout: float = 3.0  # the X axis is not followed over a longer gap [s]
 
@@ -102,12 +105,13 @@ class _View:
     focal: float  # [px]
     points: np.ndarray  # (n, 2)
     side: np.ndarray  # (n,) int
-    scale: np.ndarray  # (n,) px per unit of distance from the side in the ideal image
+    scale: np.ndarray  # (4,) px of the raw image per unit of distance from each side in the ideal one
     sigma: float  # [px]
     lines: np.ndarray  # (4, 3)
     corners: np.ndarray  # (4, 2)
     green: np.ndarray  # (m, 2)
     trust: np.ndarray  # (n,) 0..1: weight as a point of its own side
+    information: np.ndarray  # (8, 8) of the nodes' distances [1/px^2], or zeros
 
 
 @dc.dataclass(frozen=True)
@@ -117,7 +121,7 @@ class _Moments:
     R_CL: np.ndarray  # (views, 3, 3)
     p_CL: np.ndarray  # (views, 3)
     right: np.ndarray  # (views,) 1.0 for the right camera, which a relative yaw moves
-    B: np.ndarray  # (views, 4, 3, 3) [sigma]
+    B: np.ndarray  # (views, 12, 12) of the four sides' l [sigma]
     floor: float  # chi^2 of the points about their own sides' best lines
 
 
@@ -128,6 +132,7 @@ class _Fit:
     yaw: float  # of the right camera against its calibration [rad]
     cost: float  # chi^2
     information: np.ndarray  # (6 or 7, 6 or 7): theta, p, yaw
+    prior: np.ndarray  # (6 or 7,) of these, the diagonal of its own information
 
 
 def estimate(
@@ -137,7 +142,8 @@ def estimate(
     views, reason = _views(edges, head, config)
     if reason:
         return _refuse(edges, config, reason)
-    moments = _moments(views, [view.trust for view in views], config)
+    weights = [view.trust for view in views]
+    moments = _moments(views, weights, config)
     model = marker.corners()
     fits = _candidates(views, moments, model, config)
     if not fits:
@@ -153,19 +159,19 @@ def estimate(
         if reason:
             return _refuse(edges, config, reason)
         inflation = 1.0
-        weights = [view.trust for view in views]
     else:
-        weights = [_weights(view, _point_residuals(view, best, model), config) for view in views]
-        moments = _moments(views, weights, config)
+        if not all(view.information.any() for view in views):
+            weights = [_weights(view, _point_residuals(view, best, model), config) for view in views]
+            moments = _moments(views, weights, config)
         best = _refine(moments, model, best.R, best.p, best.yaw, config)
         if best is None:
             return _refuse(edges, config, "no pose explains the sides")
-        covariance = np.linalg.inv(best.information)[:6, :6]
+        covariance = _covariance(moments, model, best)
         # Misfit of whole sides, that independent points do not show: calibration, a marker that is not flat.
         inflation = (best.cost - moments.floor) / (8 * len(views) - 6)
     square = sum(float((w * _point_residuals(v, best, model) ** 2).sum()) for v, w in zip(views, weights))
     residual = math.sqrt(square / max(sum(float(w.sum()) for w in weights), 1e-9))
-    if inflation > 3:
+    if inflation > _chance(8 * len(views) - 6):
         covariance, ambiguity = covariance * inflation, ambiguity / inflation
     reason = _gate(views, best, residual, config)
     X_LV = frames.make(best.R, best.p)
@@ -186,6 +192,11 @@ def estimate(
         corners_right=edges.right.corners_px if edges.right.found else [],
         reason=reason,
     )
+
+
+def _chance(freedom: int) -> float:
+    """chi^2 per degree of freedom that chance exceeds once in 10^4 (Wilson and Hilferty)."""
+    return (1 - 2 / (9 * freedom) + 3.72 * math.sqrt(2 / (9 * freedom))) ** 3
 
 
 # ---------------------------------------------------------------- the edges of the cameras
@@ -216,10 +227,14 @@ def _view(
     if np.bincount(side, minlength=4).min() < 2:
         return "a side has fewer than two points"
     sigma = max(quad.sigma, config.min_sigma)
-    lines, trust = _robust_lines(quad.points, side, sigma / lens.focal(), config)
-    if lines is None:
-        return "sides do not make a quadrilateral"
-    corners = meet(lines)
+    if quad.information.any():
+        corners, trust = quad.corners, np.ones(len(side))
+        lines = _joining(corners)
+    else:
+        lines, trust = _robust_lines(quad.points, side, sigma / lens.focal(), config)
+        if lines is None:
+            return "sides do not make a quadrilateral"
+        corners = meet(lines)
     d = corners[NEXT] - corners
     turning = d[:, 0] * d[NEXT, 1] - d[:, 1] * d[NEXT, 0]
     if not (np.isfinite(corners).all() and (turning > 0).all()):
@@ -234,13 +249,21 @@ def _view(
         focal=lens.focal(),
         points=quad.points,
         side=side,
-        scale=(1 / stretch)[side],
+        scale=1 / stretch,
         sigma=sigma,
         lines=lines,
         corners=corners,
         green=quad.green,
         trust=trust,
+        information=quad.information * min(quad.sigma / sigma, 1) ** 2,
     )
+
+
+def _joining(corners: np.ndarray) -> np.ndarray:
+    """The lines (4, 3) of the sides between corners (4, 2), positive inside; unit normals."""
+    q = np.column_stack([corners, np.ones(4)])
+    lines = _cross(q, q[NEXT])
+    return lines / np.hypot(lines[:, 0], lines[:, 1])[:, None]
 
 
 def _robust_lines(
@@ -289,22 +312,40 @@ def _aligned(left: _View, right: _View) -> _View:
     turn = min(range(4), key=lambda k: float(((a - np.roll(b, -k, axis=0)) ** 2).sum()))
     if turn == 0:
         return right
-    lines, corners = np.roll(right.lines, -turn, axis=0), np.roll(right.corners, -turn, axis=0)
-    return dc.replace(right, side=(right.side - turn) % 4, lines=lines, corners=corners)
+    lines, corners, scale = (np.roll(a, -turn, axis=0) for a in (right.lines, right.corners, right.scale))
+    nodes = (np.arange(8) + 2 * turn) % 8
+    information = right.information[np.ix_(nodes, nodes)]
+    return dc.replace(
+        right,
+        side=(right.side - turn) % 4,
+        scale=scale,
+        lines=lines,
+        corners=corners,
+        information=information,
+    )
 
 
 def _moments(views: list[_View], weights: list[np.ndarray], config: RectangleEstimatorConfig) -> _Moments:
-    B = np.zeros((len(views), 4, 3, 3))
+    B = np.zeros((len(views), 12, 12))
     floor = 0.0
-    for view, weight, out in zip(views, weights, B):
+    for view, weight, rows in zip(views, weights, B):
         # A side is not better known than its common bias, however many points it has.
+        along = view.corners[NEXT] - view.corners
+        bias = config.side_bias * np.clip((_SHORT_SIDE / (view.focal * np.linalg.norm(along, axis=1))) ** 3, 1, 10)
+        if view.information.any():
+            # Two nodes make a side: each has twice the variance of the bias.
+            covariance = np.linalg.inv(view.information) + np.diag(np.repeat(2 * bias**2, 2))
+            nodes = view.corners[:, None] + np.multiply.outer(along, NODES).transpose(0, 2, 1)  # (4, 2, 2)
+            distance = np.zeros((4, 2, 4, 3))  # of the nodes from the sides, by l
+            distance[_FOUR, :, _FOUR] = np.concatenate([nodes, np.ones((4, 2, 1))], -1) * view.scale[:, None, None]
+            rows[:8] = np.linalg.cholesky(np.linalg.inv(covariance)).T @ distance.reshape(8, 12)
+            continue
         information = np.bincount(view.side, weight, 4) / view.sigma**2
-        length = view.focal * np.linalg.norm(view.corners[NEXT] - view.corners, axis=1)
-        bias = config.side_bias * np.clip((_SHORT_SIDE / length) ** 3, 1, 10)
         share = 1 / (1 + information * bias**2)
-        w = weight * share[view.side] * (view.scale / view.sigma) ** 2
+        w = weight * share[view.side] * (view.scale[view.side] / view.sigma) ** 2
         total, mean, S = _side_moments(view.points, view.side, w)
         root = np.sqrt(total)
+        out = np.zeros((4, 3, 3))
         out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = root * mean[:, 0], root * mean[:, 1], root
         c11 = np.sqrt(S[:, 0, 0]) + 1e-150
         c21 = S[:, 0, 1] / c11
@@ -312,6 +353,7 @@ def _moments(views: list[_View], weights: list[np.ndarray], config: RectangleEst
         out[:, 2, 1] = np.sqrt(np.maximum(S[:, 1, 1] - c21**2, 0))
         half, gap = (S[:, 0, 0] + S[:, 1, 1]) / 2, np.hypot((S[:, 0, 0] - S[:, 1, 1]) / 2, S[:, 0, 1])
         floor += float(np.maximum(half - gap, 0).sum())
+        rows.reshape(4, 3, 4, 3)[_FOUR, :, _FOUR] = out
     return _Moments(
         R_CL=np.stack([view.X_CL[:, :3] for view in views]),
         p_CL=np.stack([view.X_CL[:, 3] for view in views]),
@@ -328,7 +370,7 @@ def _point_residuals(view: _View, fit: _Fit, model: np.ndarray) -> np.ndarray:
         P = P @ frames.rot_y(fit.yaw)
     h = _cross(P, P[NEXT])
     line = (h / np.hypot(h[:, 0], h[:, 1])[:, None])[view.side]
-    return ((line[:, :2] * view.points).sum(1) + line[:, 2]) * view.scale
+    return ((line[:, :2] * view.points).sum(1) + line[:, 2]) * view.scale[view.side]
 
 
 def _weights(view: _View, residual: np.ndarray, config: RectangleEstimatorConfig) -> np.ndarray:
@@ -366,8 +408,9 @@ def _linearize(
     norm = np.sqrt(h[..., 0] ** 2 + h[..., 1] ** 2)
     line = h / norm[..., None]
     dl = (dh - line[..., None] * (line[..., None, :2] @ dh[..., :2, :])) / norm[..., None, None]
-    r = (moments.B @ line[..., None]).ravel()
-    return r, (moments.B @ dl).reshape(-1, 7)
+    count = len(line)
+    r = (moments.B @ line.reshape(count, 12, 1)).ravel()
+    return r, (moments.B @ dl.reshape(count, 12, 7)).reshape(-1, 7)
 
 
 def _refine(
@@ -411,7 +454,32 @@ def _refine(
         if gain < enough or damping > 1e8:
             break
     J = at[1][:, :n]
-    return _Fit(R=R, p=p, yaw=float(yaw), cost=float(cost), information=J.T @ J + np.diag(prior))
+    information = J.T @ J + np.diag(prior)
+    return _Fit(R=R, p=p, yaw=float(yaw), cost=float(cost), information=information, prior=prior)
+
+
+def _covariance(moments: _Moments, model: np.ndarray, fit: _Fit) -> np.ndarray:
+    """(6, 6) of theta and p, for the most frontal tilt within two standard deviations.
+
+    Foreshortening goes with the square of the tilt: a marker seen almost frontally seems to know its tilt the better
+    the more noise has tilted it.
+    """
+    C = np.linalg.inv(fit.information)
+    sight = fit.R.T @ fit.p / np.linalg.norm(fit.p)
+    axis = np.array([-sight[1], sight[0], 0.0])  # z x sight: turning about it brings z to the line of sight
+    tilt = math.atan2(math.hypot(sight[0], sight[1]), sight[2])
+    if tilt < 1e-9:
+        return C[:6, :6]
+    axis /= np.linalg.norm(axis)
+    way = C[:, :3] @ axis  # what goes with it
+    variance = float(axis @ way[:3])
+    step = way * min(tilt, 2 * math.sqrt(variance)) / variance
+    yaw = fit.yaw + step[6] if len(step) == 7 else 0.0
+    at = _linearize(moments, model, fit.R @ frames.rotation(step[:3]), fit.p + step[3:6], yaw)
+    if at is None:
+        return C[:6, :6]
+    J = at[1][:, : len(C)]
+    return np.linalg.inv(J.T @ J + np.diag(fit.prior))[:6, :6]
 
 
 def _candidates(
@@ -432,15 +500,12 @@ def _candidates(
         fits = _distinct(moments, model, [closed] if closed is not None else [], config)
     if len(fits) == 1:
         mirrored = _mirrored(fits[0].R, fits[0].p)
-        at = _linearize(moments, model, *mirrored, fits[0].yaw)
-        if at is None:
+        left = _moved_to_fit(moments, model, *mirrored)
+        if not math.isfinite(left):
             return fits
         # The mirrored tilt itself, moved to fit, stands for a minimum that it may not have.
-        J, r = at[1][:, 3:6], at[0]
-        left = r - J @ np.linalg.lstsq(J, r, rcond=None)[0]
-        stand_in = dc.replace(fits[0], R=mirrored[0], cost=max(float(left @ left), fits[0].cost))
-        if stand_in.cost < fits[0].cost + _HOPELESS:
-            fits = _distinct(moments, model, [mirrored], config, known=fits)
+        stand_in = dc.replace(fits[0], R=mirrored[0], cost=max(left, fits[0].cost))
+        fits = _distinct(moments, model, [mirrored], config, known=fits)
         if len(fits) == 1:
             fits.append(stand_in)
     return fits
@@ -458,11 +523,23 @@ def _distinct(
     for R, p in starts:
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
             continue
+        if fits and _moved_to_fit(moments, model, R, p) > fits[0].cost + _HOPELESS:
+            continue
         fit = _refine(moments, model, R, p, 0.0, config, enough=0.05)
         if fit is not None and fit.R[2, 2] > 0:
             if not any(np.linalg.norm(frames.rotation_vector(fit.R.T @ other.R)) < 1e-3 for other in fits):
                 fits.append(fit)
     return sorted(fits, key=lambda fit: fit.cost)
+
+
+def _moved_to_fit(moments: _Moments, model: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
+    """chi^2 of this orientation at the position that suits it best; infinite behind a camera."""
+    at = _linearize(moments, model, R, p, 0.0)
+    if at is None:
+        return math.inf
+    J, r = at[1][:, 3:6], at[0]
+    g = J.T @ r
+    return float(r @ r - g @ np.linalg.solve(J.T @ J, g))
 
 
 def _to_left(view: _View, R: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -660,7 +737,7 @@ def _paper(
     R, p = found
     columns = []
     for c, view in enumerate(views):
-        w = view.trust * (view.scale / view.sigma) ** 2
+        w = view.trust * (view.scale[view.side] / view.sigma) ** 2
         total, mean, S = _side_moments(view.points, view.side, w)
         for k in range(4):
             normal = view.lines[k, :2]
@@ -676,7 +753,7 @@ def _paper(
                     return None, None, "the closed form has no solution nearby"
                 columns.append(np.append(frames.rotation_vector(R.T @ there[0]), there[1] - p))
     J = np.array(columns)
-    fit = _Fit(R=R, p=p, yaw=0.0, cost=0.0, information=np.eye(6))
+    fit = _Fit(R=R, p=p, yaw=0.0, cost=0.0, information=np.eye(6), prior=np.zeros(6))
     return fit, J.T @ J, ""
 
 

@@ -2,7 +2,7 @@
 
 `match` chooses the pair of candidates, one of each head camera, that can be one rectangle of the known size: both
 centres on one epipolar line, the same depth by triangulation as by size. `triangulate` gives the centre's position
-with its covariance.
+with its covariance. `wrong_size` measures the sides that are fitted later, by both cameras together.
 """
 
 import dataclasses as dc
@@ -15,6 +15,7 @@ from valve_drake import frames
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require_in
 from valve_drake.messages import MarkerCandidate, SegmentationPair, StereoPosition
+from valve_drake.perception.color_segmentation import middle
 from valve_drake.perception.marker import NEXT, Marker
 
 
@@ -25,6 +26,8 @@ class StereoPositioningConfig:
     size_gate: float = 0.18  # relative difference of depth by triangulation and by size that is allowed
     corner_sigma: float = 1.0  # of a candidate's coarse corners, widens both gates on small ones [px]
     shape_gate: float = 0.08  # misfit of the coarse corners to the rectangle, as a share of its size
+    side_gate: float = 0.08  # relative error of a side's length, measured by both cameras together, that is allowed
+    side_sigma: float = 0.3  # of a fitted corner's disparity, beside the calibration's; widens that gate [px]
     yaw_sigma: float = 0.0  # of the relative yaw of the two cameras, for the covariance only; 0 = known [rad]
     min_distance: float = 0.25  # [m]
     max_distance: float = 6.5  # [m]
@@ -36,6 +39,8 @@ class StereoPositioningConfig:
             ("size_gate", 0.01, 1),
             ("corner_sigma", 0, 20),
             ("shape_gate", 0.01, 1),
+            ("side_gate", 0.01, 10),
+            ("side_sigma", 0, 20),
             ("yaw_sigma", 0, 0.2),
             ("min_distance", 0.01, 100),
             ("max_distance", self.min_distance, 100),
@@ -119,21 +124,12 @@ def triangulate(
     X_RL = frames.inverse(head.X_LR)
     xy = [head.left.normalize(center_left), head.right.normalize(center_right)]
     focal = [head.left.focal(), head.right.focal()]
-    # Start: the mid-point of the rays' common perpendicular.
-    a = np.append(xy[0], 1.0)
-    b = head.X_LR[:, :3] @ np.append(xy[1], 1.0)
-    aa, ab, bb = a @ a, a @ b, b @ b
-    det = aa * bb - ab * ab
-    if det < 1e-12 * aa * bb:
-        return np.full(3, np.nan), np.full((3, 3), np.inf), math.inf
-    ta, tb = a @ head.X_LR[:, 3], b @ head.X_LR[:, 3]
-    s, t = (bb * ta - ab * tb) / det, (ab * ta - aa * tb) / det
-    p = (s * a + head.X_LR[:, 3] + t * b) / 2
+    p = _mid_points(xy[0][None], xy[1][None], head)[0][0]
     for _ in range(3):
         r, J, yaw = [], [], []
         for X, seen, f in ((frames.make(np.eye(3), np.zeros(3)), xy[0], focal[0]), (X_RL, xy[1], focal[1])):
             q = X[:, :3] @ p + X[:, 3]
-            if q[2] <= 1e-6:
+            if not q[2] > 1e-6:
                 return np.full(3, np.nan), np.full((3, 3), np.inf), math.inf
             P = np.array([[1, 0, -q[0] / q[2]], [0, 1, -q[1] / q[2]]]) / q[2] * f
             r.append((q[:2] / q[2] - seen) * f)
@@ -144,6 +140,45 @@ def triangulate(
         p = p - N @ (J.T @ r)
     by_yaw = N @ (J.T @ yaw) * yaw_sigma
     return p, N * sigma**2 + np.outer(by_yaw, by_yaw), float(np.linalg.norm(r))
+
+
+def wrong_size(
+    left: np.ndarray, right: np.ndarray, head: StereoHead, marker: Marker, config: StereoPositioningConfig
+) -> str:
+    """Why two quadrilaterals, (4, 2) ideal corners each, are not the marker in both images; "" if they may be.
+
+    Their corners are triangulated, with no knowledge of the marker. The means of opposite sides (as vectors: the
+    corners' errors in depth do not lengthen them) must have the marker's lengths. One camera cannot tell a long box
+    from the marker seen at a slant, two can.
+    """
+    a, b = left - left.mean(0), right - right.mean(0)
+    turn = min(range(4), key=lambda k: float(((a - np.roll(b, -k, axis=0)) ** 2).sum()))
+    P, _ = _mid_points(left, np.roll(right, -turn, axis=0), head)
+    sides = P[NEXT] - P
+    lengths = np.linalg.norm(sides[:2] - sides[2:], axis=1) / 2
+    baseline = max(float(np.linalg.norm(head.X_LR[:, 3])), 1e-9)
+    per_pixel = P[:, 2].mean() ** 2 / (head.right.focal() * baseline)  # of disparity [m]
+    x, y = marker.size
+    off = min(float(np.abs(lengths / size - 1).max()) for size in ([x, y], [y, x]))
+    if not off <= config.side_gate + (config.side_sigma + head.rms_px) * per_pixel / min(x, y):
+        return f"sides: {1000 * lengths[0]:.0f} x {1000 * lengths[1]:.0f} mm"
+    return ""
+
+
+def _mid_points(left: np.ndarray, right: np.ndarray, head: StereoHead) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rays of ideal points (n, 2) come nearest, (n, 3) in L, and the gap between them (n,) [m].
+
+    NaN for parallel rays.
+    """
+    one = np.ones((len(left), 1))
+    t = head.X_LR[:, 3]
+    a, b = np.hstack([left, one]), np.hstack([right, one]) @ head.X_LR[:, :3].T
+    aa, ab, bb, ta, tb = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1), a @ t, b @ t
+    det = aa * bb - ab * ab
+    det = np.where(det < 1e-12 * aa * bb, np.nan, det)
+    on_a = ((bb * ta - ab * tb) / det)[:, None] * a
+    on_b = ((ab * ta - aa * tb) / det)[:, None] * b + t
+    return (on_a + on_b) / 2, np.linalg.norm(on_a - on_b, axis=1)
 
 
 def _by_size(candidate: MarkerCandidate, lens: LensModel, marker: Marker) -> list[tuple[float, float]]:
@@ -193,11 +228,14 @@ def _disagreement(
     misfits = [max(a[1], b[1]) for a, b in zip(fits_left, fits_right)]
     if min(misfits) > gate:
         return 0.0, f"shape: corners off by {min(misfits):.2f} of its size"
-    p, _, off = triangulate(left.center, right.center, head, config.center_sigma)
-    if not np.isfinite(p).all():
+    # Not the areas' centres: near and tilted, they are not images of one point.
+    P, gap = _mid_points(
+        head.left.normalize(middle(left.corners)[None]), head.right.normalize(middle(right.corners)[None]), head
+    )
+    p = P[0]
+    if not p[2] > 0:
         return 0.0, "rays do not meet"
-    # The residual of both cameras together; the epipolar distance is sqrt(2) of it.
-    off *= math.sqrt(2)
+    off = float(gap[0]) / p[2] * head.right.focal()
     if off > config.epipolar_gate:
         return 0.0, f"epipolar: {off:.1f} px"
     if not config.min_distance < p[2] < config.max_distance:

@@ -1,0 +1,134 @@
+"""Four sides fitted together, on drawn images whose true sides are known."""
+
+import numpy as np
+import pytest
+
+from valve_drake import frames
+from valve_drake.analysis import experiments
+from valve_drake.analysis.drawn_images import PLATE, Canvas, draw_board
+from valve_drake.perception import joint_fit as mut
+from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads, side_lines
+from valve_drake.perception.marker import NEXT, Marker
+
+EYE, MARKER = experiments.head().left, Marker()
+
+
+def pose(z, tilt=0.5, roll=0.3):
+    return experiments._tilted(np.array([0.02, 0.01, z]), tilt, 0.7, roll)
+
+
+def canvas(X, blur=0.7):
+    out = Canvas(EYE, blur)
+    draw_board(out, X, MARKER)
+    return out
+
+
+def true_corners(X):
+    P = frames.apply(X, MARKER.corners())
+    return P[:, :2] / P[:, 2:]
+
+
+def fit(image, X):
+    return fit_quads([image], [EYE.project(true_corners(X))], LineFittingConfig())[0]
+
+
+def distances(quad, X):
+    """By how much the fitted sides lie further in than the true ones, at NODES (8,) [px]."""
+    q = true_corners(X)
+    n = quad.together.shape[1]
+    lines = side_lines(EYE.normalize(quad.together.reshape(-1, 2)), np.repeat(np.arange(4), n))[0]
+    middle = q.mean(0)
+    lines *= np.sign(lines[:, :2] @ middle + lines[:, 2])[:, None]
+    nodes = q[:, None] + np.multiply.outer(q[NEXT] - q, mut.NODES).transpose(0, 2, 1)
+    stretch = np.linalg.norm((lines[:, None, :2] @ EYE.normalize_jacobian(EYE.project(nodes.mean(1))))[:, 0], axis=1)
+    return -((nodes @ lines[:, :2, None])[..., 0] + lines[:, 2:]).ravel() / np.repeat(stretch, 2)
+
+
+@pytest.mark.parametrize("z", [0.5, 1.2, 2.5])
+@pytest.mark.parametrize("tilt", [0.0, 0.8])
+def test_sides_without_noise_are_true_to_two_thousandths(z, tilt):
+    X = pose(z, tilt)
+    rng = np.random.default_rng(0)
+    # Rounding alone is no noise of its own: two tenths of a grey level stand for it.
+    quad = fit(canvas(X).finish(rng, 0.2), X)
+    assert quad.together is not None
+    assert np.abs(distances(quad, X)).max() < 2e-3
+
+
+@pytest.mark.parametrize("z", [0.8, 2.5])
+def test_covariance_is_honest_and_less_than_that_of_sides_alone(z):
+    X, rng, values, gain = pose(z, 0.6), np.random.default_rng(1), [], []
+    clean = canvas(X)
+    for _ in range(60):
+        quad = fit(clean.finish(rng, 2.0), X)
+        if quad.information is None:  # one in a hundred, by chance
+            continue
+        e = distances(quad, X)
+        values.append(e @ quad.information @ e / 8)
+        alone = 2 * quad.sigma**2 / np.bincount(quad.side, minlength=4)  # of a node, from the points
+        gain.append(np.repeat(alone, 2) / np.diag(np.linalg.inv(quad.information)))
+    assert len(values) >= 55
+    assert abs(np.mean(values) - 1) < 4 * np.sqrt(2 / (8 * len(values)))
+    assert np.mean(gain) > 1.1
+
+
+def test_light_that_differs_from_side_to_side_keeps_the_sides_apart():
+    X = pose(1.2)
+    drawn = canvas(X)
+    strip = frames.compose(X, frames.make(np.eye(3), np.array([0.0, 0.075, 0.0])))
+    drawn.rectangle(strip, tuple(0.9 * np.array(PLATE)), (0.2, 0.0249))  # the board is darker beyond one side
+    quad = fit(drawn.finish(np.random.default_rng(0), 1.0), X)
+    assert quad.reason == "" and quad.information is None
+
+
+def test_a_corner_that_is_worn_off_is_not_used():
+    X, rng = pose(1.0), np.random.default_rng(2)
+    whole, worn = canvas(X), canvas(X)
+    chip = frames.make(frames.rot_z(np.pi / 4), np.array([0.049, 0.05, 0.0]))
+    worn.rectangle(frames.compose(X, chip), PLATE, (0.0018, 0.0018))
+    good, bad = (fit(drawn.finish(rng, 2.0), X) for drawn in (whole, worn))
+    assert np.linalg.slogdet(bad.information)[1] < np.linalg.slogdet(good.information)[1]
+    e = distances(bad, X)
+    assert e @ bad.information @ e / 8 < 2.5
+
+
+def test_a_wedge_is_the_integral_of_the_blurred_corner():
+    a, b = np.random.default_rng(0).uniform(-2.5, 2.5, (2, 40))
+    x = (np.arange(4000) + 0.5) / 4000 * 12 - 6
+    density = np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi) * 12 / 4000
+    for rho in (0.0, 0.3, -0.45):
+        cover, by_a, by_b = mut._wedge(a, b, np.full(40, rho))
+        # P(X < a, Y < b) = integral over x < a of P(Y < b | x)
+        given = mut.normal_cdf((b[:, None] - rho * x) / np.sqrt(1 - rho**2))
+        np.testing.assert_allclose(cover, ((x < a[:, None]) * given) @ density, atol=2.5e-3)
+        h = 1e-4
+        up, down = (mut._wedge(a + s * h, b, np.full(40, rho))[0] for s in (1, -1))
+        np.testing.assert_allclose(by_a, (up - down) / (2 * h), atol=1.2e-2)
+        np.testing.assert_allclose(by_b, mut._wedge(b, a, np.full(40, rho))[1], atol=1e-12)
+
+
+def test_jacobian_of_the_corner_pixels_equals_finite_differences():
+    flat = np.array([True, False, True, False])
+    curves = mut.Curves(
+        flat=flat,
+        inward=np.array([1.0, -1.0, -1.0, 1.0]),
+        first=np.array([24, 24, 24, 24]),
+        count=np.array([33, 33, 33, 33]),
+        start=np.array([20.2, 60.4, 60.1, 19.7]),
+        slope=np.array([0.1, -0.1, 0.1, -0.1]) * 0.3,
+        coefficient=np.array([[0.1, 0.05, 0.02]] * 4),
+    )
+    channel = np.random.default_rng(0).random((81, 81)).astype(np.float32)
+    planes, frame = np.array([0.02, 0.01, -0.01, 0.97, 0.02, 0.01]), (np.array([40.0, 40.0]), 20.0)
+    ends = np.rint(mut._corners(curves))
+
+    def pixels(d):
+        shift = d[6:18].reshape(4, 3) * (curves.inward / curves.cosine())[:, None]
+        moved = mut.dc.replace(curves, coefficient=curves.coefficient + shift)
+        return mut._corner_pixels(channel, moved, ends, planes + d[:6], 0.8 + d[18], frame, 1e4)
+
+    J, _ = pixels(np.zeros(19))
+    assert len(J) > 60
+    e = 1e-5
+    numeric = np.stack([(pixels(-e * d)[1] - pixels(e * d)[1]) / (2 * e) for d in np.eye(19)], -1)
+    np.testing.assert_allclose(J, numeric, atol=6e-3 * np.abs(numeric).max())
