@@ -62,7 +62,7 @@ class KinematicApproachConfig:
     mark_ratio: float = 0.9  # sqrt(area) of the green mark over the taught one at which reaching ends
     opening: float = 0.085  # gripper open [m]
     gripper_force: float = 40.0  # while opening [N]
-    stance_period: float = 1.0  # between two searches for the stance [s]
+    stance_period: float = 0.5  # between two searches for the stance [s]
     angle_tolerance: float = 0.035  # camera angle against the command that counts as turned [rad]
 
     def check(self) -> None:
