@@ -29,7 +29,9 @@ class HandleMarkerConfig:
     segmentation: ColorSegmentationConfig = dc.field(
         default_factory=lambda: ColorSegmentationConfig(small_box=181, large_box=561, min_area=150, max_candidates=6)
     )
-    lines: LineFittingConfig = dc.field(default_factory=lambda: LineFittingConfig(color_only=True, reach=0.12))
+    lines: LineFittingConfig = dc.field(
+        default_factory=lambda: LineFittingConfig(color_only=True, reach=0.12, together=False)
+    )
     border: int = 3  # a mark this near to the image's border is cut off [px]
     min_fill: float = 0.85  # region's area over its quadrilateral's, and the inverse
     max_aspect: float = 4.0  # long side over short side in the image

@@ -35,6 +35,7 @@ _LARGE = 100  # of a quadrilateral of this size coarse lines are looked for at h
 _EVEN = 0.1  # deviation over mean of the marker's inside above which a shadow is looked for
 _ONE_HUE = 0.96  # least cosine between the marker's colour in the shadow and in the light
 _TWO_LEVELS = 0.25  # share of that variance which two lights leave unexplained at most
+_ENOUGH = 30  # profiles of a side that find the way to its edge
 _PRIOR_POINTS = 20  # how many points the noise predicted from the grey values counts for, against the scatter seen
 
 
@@ -45,6 +46,7 @@ class LineFittingConfig:
     trim: float = 2.5  # of a side at each corner, beyond the profile's reach [px]
     gamma: float = 1.0  # light = value^gamma; 1 if pixel values are linear in light, 2.2 for ordinary cameras
     iterations: int = 5
+    together: bool = True  # all sides and their corners are fitted once more with what they share
     max_sigma: float = 0.4  # scatter of the edge points about the side [px]
     min_contrast: float = 10.0  # between inside and outside [grey levels, over all channels]
     min_share: float = 0.5  # of a side's profiles that must fit
@@ -372,29 +374,38 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
     origin = np.repeat(np.cumsum([0] + [q.channel.size for q in quads[:-1]]), 4)[:, None, None]
     cosine = 1 / np.sqrt(1 + slope**2)
 
-    k = np.arange(count.max())
-    t = first[:, None] + k  # (S, N)
-    used = (k < count[:, None]).astype(float)
-    tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1 along each side
-    from_end = np.minimum(k, count[:, None] - 1 - k)
-    room = half[:, None] - np.maximum(spare[:, None] - from_end / np.maximum(lean, 1e-3)[:, None], 0)
-    room = (np.minimum(room, half[:, None]) + 1).astype(np.float32)[:, :, None]  # (S, N, 1)
-    line = start[:, None] + slope[:, None] * t
-    reach = int(half.max()) + 2
-    y = np.rint(line)[:, :, None] + np.arange(-reach, reach + 1)  # (S, N, M)
     columns = flat[:, None, None]
-    in_image = (y >= 0) & (y < np.where(columns, tall, wide))
-    yi = np.where(in_image, y, 0).astype(int)
-    ti = np.minimum(t[:, :, None], np.where(columns, wide, tall) - 1)
-    f = pixels[origin + np.where(columns, yi * wide + ti, ti * wide + yi)]  # float32, as all that is per pixel
+    reach = int(half.max()) + 2
 
-    powers = basis(tau)  # (S, N, 3)
+    def profiles(k: np.ndarray) -> tuple:
+        """Those with numbers k on each side: all that the fit needs of them."""
+        t = first[:, None] + k  # (S, N)
+        used = (k < count[:, None]).astype(float)
+        tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1 along each side
+        from_end = np.minimum(k, count[:, None] - 1 - k)
+        room = half[:, None] - np.maximum(spare[:, None] - from_end / np.maximum(lean, 1e-3)[:, None], 0)
+        room = (np.minimum(room, half[:, None]) + 1).astype(np.float32)[:, :, None]  # (S, N, 1)
+        line = start[:, None] + slope[:, None] * t
+        y = np.rint(line)[:, :, None] + np.arange(-reach, reach + 1)  # (S, N, M)
+        in_image = (y >= 0) & (y < np.where(columns, tall, wide))
+        yi = np.where(in_image, y, 0).astype(int)
+        ti = np.minimum(t[:, :, None], np.where(columns, wide, tall) - 1)
+        f = pixels[origin + np.where(columns, yi * wide + ti, ti * wide + yi)]  # float32, as all that is per pixel
+        valid = (used[:, :, None] * in_image).astype(np.float32)
+        return t, used, tau, room, line, y, f, valid, basis(tau)
+
+    # On long sides the way there is found with some of the profiles, and the last step is made with all of them.
+    stride = max(int(count.min()) // _ENOUGH, 1)
+    t, used, tau, room, line, y, f, valid, powers = profiles(np.arange(0, count.max(), stride))
     coefficient = np.zeros((len(count), 3))  # of the sides' deviation from their first straight lines
     bend = np.where(count >= 24, 1e-9, 1e9)  # short sides show no curvature of the lens
-    valid = (used[:, :, None] * in_image).astype(np.float32)
     good, blur, last = used, np.full(len(count), 1.0), False
     has_step = np.full(len(count), True)
     for iteration in range(config.iterations):
+        if last and stride > 1:
+            k = np.arange(count.max())
+            t, used, tau, room, line, y, f, valid, powers = profiles(k)
+            good = used * good[:, k // stride]
         curve = line + (powers @ coefficient[:, :, None])[:, :, 0]
         offset = (y - curve[:, :, None]).astype(np.float32)
         # No pixel enters or leaves at once.
@@ -431,7 +442,7 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         last = settled or iteration == config.iterations - 2
     edge = curve + moved
     curves = Curves(flat, inward, first, count, start, slope, coefficient)
-    seen = sums(weight, good, rise, gain, z, residual, tau)
+    seen = sums(weight, good, rise, gain, z, residual, tau) if config.together else None
     points = np.where(columns, np.stack([t, edge], -1), np.stack([edge, t], -1))
     deviation = good * ((moved - smooth) * cosine[:, None]) ** 2
     predicted = good * typical[:, None] / strength
@@ -458,8 +469,10 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
             continue
         side = np.broadcast_to(np.arange(4)[:, None], keep.shape)[keep]
         scatter = float((deviation * strength)[own].sum()), float(freedom)
-        shared = joint_fit(quads[q].channel, curves[own], level[own], width[4 * q], seen[own], bend[own], scatter)
-        together, information = shared or (None, None)
+        together, information = None, None
+        if config.together:
+            shared = joint_fit(quads[q].channel, curves[own], level[own], width[4 * q], seen[own], bend[own], scatter)
+            together, information = shared or (None, None)
         out.append(
             RawQuad(
                 points=points[own][keep],
