@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 
-.PHONY: run test slow draw clean
+.PHONY: run test slow readers draw clean
 
 run: $(READY)
 	$(BIN)/valve-drake run $(ARGS)
@@ -14,6 +14,12 @@ test: $(READY)
 
 slow: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# Other people's readers on a log (LOG=FILE, else on a run made for it); those that cannot be installed are skipped.
+readers: $(READY)
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[readers]'
+	-npm install --silent --no-audit --no-fund --no-package-lock --prefix tests/readers
+	LOG=$(LOG) $(BIN)/python -m pytest -m readers -rs
 
 draw: $(READY)
 	$(BIN)/valve-drake draw

@@ -381,6 +381,43 @@ def test_hold_brakes_within_the_acceleration_limit_and_inside_the_range():
         assert after == 0
 
 
+def test_a_silent_device_holds_its_group_and_one_silent_arm_holds_both():
+    arms = {"left_arm", "right_arm"}
+    for device, held in (("torso", {"torso"}), ("left_arm", arms), ("left_gripper", {"left_gripper"})):
+        bench = Bench(Mode.TURN)
+        bench.tick()
+        bench.health = Health(devices=("base", device), ages=np.array([0.0, CONFIG.max_age + 0.01]))
+        before = {port: bench.out(port) for port in PORTS}
+        report = bench.tick(left_arm=HOME + 0.1, right_arm=HOME * MIRROR + 0.1)
+        assert {group for group, source in zip(GROUPS, report.source) if source == "hold"} == held | {"base"}
+        assert f"{device} silent" in " ".join(report.refused)
+        for group in held:
+            assert np.array_equal(bench.out(f"{group}.position_command"), before[f"{group}.position_command"])
+
+
+def test_a_device_whose_age_is_not_a_number_is_silent():
+    bench = Bench()
+    bench.health = Health(devices=("torso",), ages=np.array([np.nan]))
+    assert bench.tick().source[GROUPS.index("torso")] == "hold"
+
+
+@pytest.mark.parametrize("lost", [0.3, np.nan])
+def test_a_joint_that_does_not_follow_is_reported_after_a_quarter_of_a_second(lost):
+    bench = Bench()
+    assert not bench.tick(torso=np.zeros(3), base_twist=np.zeros(2)).astray
+    bench.robot = dc.replace(bench.robot, left_arm=HOME + lost)
+    reports = [bench.tick(torso=np.zeros(3), base_twist=np.zeros(2)) for _ in range(40)]
+    assert [r.astray for r in reports[:32]] == [()] * 32 and reports[33].astray == ("left_arm",)
+
+
+def test_a_base_that_does_not_follow_is_reported():
+    bench = Bench(Mode.SEARCH)
+    report = None
+    for _ in range(128):
+        report = bench.tick(torso=np.zeros(3), base_twist=np.array([0.5, 0.0]))
+    assert report.astray == ("base",)
+
+
 def test_an_emergency_stop_holds_all_but_the_grippers():
     bench = Bench(Mode.RELEASE)
     bench.health = Health(estop=True)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.JointState_pb2 import JointState
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from google.protobuf import descriptor_pb2
 from log_samples import same, samples, write_log
 from mcap.writer import IndexType, Writer
@@ -14,7 +16,6 @@ from valve_drake.checks import ConfigError
 from valve_drake.messages import Command, Message, RobotState, Segmentation, SegmentationPair, Status
 from valve_drake.recording import schemas
 from valve_drake.recording.reader import LogReader, recover
-from valve_drake.recording.signals import joints
 from valve_drake.recording.writer import LogWriter
 
 SECONDS = 3.0
@@ -78,12 +79,12 @@ def test_series_are_arrays_with_nan_for_none(whole):
 
 
 def test_series_reach_into_nested_and_repeated_messages(tmp_path):
-    row = joints("/joint_states", {"a": ["one.position", "two.position"], "b": ["two.effort"]})
     with LogWriter(tmp_path / "a.mcap") as log:
         for k in range(3):
             pair = SegmentationPair(left=Segmentation(green=np.ones((k, 3))), sequence=k)
             log.write("/pair", pair, k)
-            log.write("/joint_states", row.encode(k, np.array([k, 2.0 * k]), np.array([5.0])), k)
+            joints = [JointState(name="one", position=k), JointState(name="two", position=2 * k, effort=5)]
+            log.write("/joint_states", JointStates(joints=joints), k)
     log = LogReader(tmp_path / "a.mcap")
     found = log.series("/joint_states", ["joints.position", "joints.effort", "joints.name"])
     assert np.array_equal(found["joints.position"], [[0, 0], [1, 2], [2, 4]])

@@ -2,13 +2,16 @@
 
 import itertools
 import json
+import re
+import shutil
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from log_samples import write_log
 
-from valve_drake import cli, runner
+from valve_drake import cli, resources, runner
 from valve_drake import diagram as wires
 from valve_drake import scenario as scenarios
 from valve_drake.analysis.comparison import Comparison, differences
@@ -16,6 +19,7 @@ from valve_drake.messages import Command, Mode, Status
 from valve_drake.ports import SLOT, TICK
 from valve_drake.recording import foxglove
 from valve_drake.recording.reader import LogReader, recover
+from valve_drake.recording.schemas import Encoded, serialized
 from valve_drake.recording.signals import MEASURED
 from valve_drake.recording.writer import LogWriter
 from valve_drake.stations import contract
@@ -25,16 +29,22 @@ QUICK = ["simulation.start.distance=2.6", "simulation.start.bearing=0.1", "simul
 STOP = 2.5  # when the operator stops the run [s]
 
 
+HEAD, TAUGHT = "calibration/head.yaml", "taught/hands.yaml"
+
+
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    """A run of three seconds: search, driving, and the operator's stop."""
+    """A run of three seconds: search, driving, and the operator's stop. The files that it named are gone."""
     path, now = tmp_path_factory.mktemp("run") / "short.mcap", [0.0]
+    head, taught = (Path(shutil.copy(resources.models() / file, path.parent)) for file in (HEAD, TAUGHT))
 
     def show(progress):
         now[0] = progress.sim_time
 
-    scenario = scenarios.load(None, QUICK)
+    scenario = scenarios.load(None, [*QUICK, f"head_calibration={head}", f"taught={taught}"])
     runner.run(scenario, path, duration=3.0, show=show, stop=lambda: now[0] >= STOP)
+    head.unlink()
+    taught.unlink()
     return path
 
 
@@ -48,12 +58,15 @@ def recording(log):
     return Recording(log)
 
 
-def rewritten(log, path, topics=lambda topic: True, end=0.1, **facts):
+def rewritten(log, path, topics=lambda topic: True, end=0.1, files=True, **facts):
     """A log with some of the messages of another, and other metadata."""
     with LogWriter(path) as writer:
         writer.write_metadata("run", log.metadata["run"] | facts)
-        for topic, when, message in log.messages([t for t in log.topics if topics(t)], end=end):
-            writer.write(topic, message, when)
+        for file in log.attachments.values() if files else ():
+            writer.attach(file.name, file.media_type, file.data)
+        for record in log.records([t for t in log.topics if topics(t)], end=end):
+            kind = serialized(log.decode(record)).kind
+            writer.write(record.topic, Encoded(kind, record.data), record.time)
     return path
 
 
@@ -188,7 +201,8 @@ def test_another_image_threshold_is_found_in_the_first_image(path, log, capsys):
     out = capsys.readouterr().out
     looked = next(t for _, t, p in log.messages(["/color_segmentation/segmentation"]) if p.sequence >= 0)
     assert f"different from t = {looked:.4f} s: /color_segmentation/segmentation left.candidates" in out
-    assert "/head_left/image" not in out  # the images themselves are as recorded
+    for _, replayed, equal in re.findall(r"/head_left/image +(\d+) +(\d+) +(\d+)", out):
+        assert replayed == equal  # it looks less often, as it stays in search; what it looks at is as recorded
 
 
 def test_the_replays_own_log_is_the_same_without_the_truth_and_can_be_replayed(path, log, tmp_path, capsys):
@@ -199,6 +213,33 @@ def test_the_replays_own_log_is_the_same_without_the_truth_and_can_be_replayed(p
     assert list(again.records()) == list(log.records(recorded))
     assert again.metadata["run"]["replay_of"] == "short.mcap" and again.metadata["result"] == log.metadata["result"]
     assert runner.replay(again).comparison.identical
+
+
+def test_a_log_replays_with_its_own_files_and_set_names_others(path, log, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert log.attachments["head_calibration.yaml"].data == (resources.models() / HEAD).read_bytes()
+    assert log.attachments["taught.yaml"].data == (resources.models() / TAUGHT).read_bytes()
+    assert not runner.replay(log).notes
+    shipped = runner.replay(log, [f"head_calibration={HEAD}", f"taught={TAUGHT}"], copy=tmp_path / "shipped.mcap")
+    assert shipped.comparison.identical
+    other = (resources.models() / HEAD).read_text(encoding="utf-8").replace("u_0: 3", "u_0: 2")  # 100 px beside
+    (tmp_path / "other.yaml").write_text(other, encoding="utf-8")
+    changed = runner.replay(log, ["head_calibration=other.yaml"], copy=tmp_path / "changed.mcap")
+    assert changed.comparison.topics["/head_left/calibration"].largest.field == "K[2]"
+    assert not changed.comparison.topics["/stereo_positioning/position"].identical
+    (tmp_path / "other.yaml").unlink()  # the replay's own log stands alone, too
+    assert runner.replay(LogReader("changed.mcap")).comparison.identical
+    assert "no such file: nowhere.yaml" in one_line(capsys, ["replay", path, "--set", "taught=nowhere.yaml"], 2)
+
+
+def test_a_log_without_its_files_is_replayed_with_those_of_today_and_says_so(log, tmp_path):
+    facts = {"scenario": log.metadata["run"]["scenario"]}
+    for key, file in (("head_calibration", HEAD), ("taught", TAUGHT)):
+        recorded = next(line for line in facts["scenario"].splitlines() if line.startswith(f"{key}: "))
+        facts["scenario"] = facts["scenario"].replace(recorded, f"{key}: {file}")
+    result = runner.replay(LogReader(rewritten(log, tmp_path / "a.mcap", files=False, **facts)))
+    assert result.comparison.identical
+    assert f"the log does not hold its taught: {TAUGHT} of today stands in" in result.notes
 
 
 @pytest.mark.parametrize("kind", ["cut off", "flipped"])
@@ -218,6 +259,29 @@ def test_a_damaged_log_is_replayed_up_to_the_damage(kind, path, tmp_path, capsys
     assert saved.comparison.identical and saved.end == result["replayed_s"]
 
 
+def test_a_robots_log_has_no_truth_and_is_replayed_and_reviewed_as_any(path, log, tmp_path, capsys):
+    scenario = log.metadata["run"]["scenario"].replace("station: simulated", "station: hardware")
+    robots = rewritten(
+        log,
+        tmp_path / "a.mcap",
+        lambda topic: not topic.startswith("/truth/"),
+        3.0,
+        station="hardware",
+        scenario=scenario,
+    )
+    assert not any("truth" in topic for topic in LogReader(robots).topics)
+    result = runner.replay(LogReader(robots))
+    assert result.comparison.identical and result.end == 3.0 and not result.notes
+    assert cli.main(["review", str(robots), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["sound"] and facts["angle_true_rad"] is None and facts["outcome"] != "done"
+    assert cli.main(["review", str(robots), str(path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["topics"]["/joint_states"]["first"] is None and facts["settings"] == {
+        "station": {"a": "hardware", "b": "simulated"}
+    }
+
+
 @pytest.mark.parametrize("topic", ["/health", "/joint_states", "/operator/command", "/left_wrist/wrench"])
 def test_a_missing_topic_is_named_in_one_line(topic, log, tmp_path, capsys):
     lacking = rewritten(log, tmp_path / "a.mcap", lambda name: name != topic)
@@ -225,8 +289,9 @@ def test_a_missing_topic_is_named_in_one_line(topic, log, tmp_path, capsys):
 
 
 def test_a_missing_image_is_named_in_one_line(log, tmp_path, capsys):
-    lacking = rewritten(log, tmp_path / "a.mcap", lambda name: name != "/head_left/image")
-    assert "lacks the image 0 of head_left at t = 0.016 s" in one_line(capsys, ["replay", lacking], 2)
+    first = next(log.messages(["/head_left/image"]))[1]
+    lacking = rewritten(log, tmp_path / "a.mcap", lambda name: name != "/head_left/image", end=first + 0.1)
+    assert f"lacks the image 0 of head_left at t = {first:.3f} s" in one_line(capsys, ["replay", lacking], 2)
 
 
 def test_a_log_of_another_version_is_refused_in_one_line_or_noted(log, tmp_path, capsys):
@@ -334,6 +399,21 @@ def test_an_additional_message_or_topic_is_a_difference(small):
     assert str(comparison.first) == "/c/status only in the replay"
     assert comparison.topics["/a/command"].first.time == 3 * TICK
     assert not comparison.topics["/c/status"].identical and not comparison.topics["/a/command"].identical
+
+
+def test_a_message_that_is_written_down_in_another_way_is_equal_and_one_with_an_unknown_field_is_not(small):
+    def change(topic, k, message):
+        kind, data = serialized(message)
+        return Encoded(kind, data + {0: b"", 1: b"\x09" + bytes(8), 2: b"\xf8\x3f\x01"}[k])  # time again; field 1023
+
+    zero = {"/a/command": Command(base_twist=[0.0, 0.0]), "/b/status": Status()}
+    with LogWriter(small.path.with_name("zeros.mcap")) as writer:
+        for k in range(3):
+            for topic, message in zero.items():
+                writer.write(topic, message, k * TICK)
+    found = compared(LogReader(small.path.with_name("zeros.mcap")), change)
+    assert [topic.equal for topic in found.topics.values()] == [2, 2]
+    assert found.first == (2 * TICK, "/a/command", "(encoding)", "", "")
 
 
 def test_nothing_after_the_end_is_compared(small):

@@ -1,9 +1,16 @@
 """`valve-drake review` from the outside: pages, JSON, tables, exit codes, and one line for whatever cannot be read."""
 
+import contextlib
 import csv
 import io
 import json
+import os
+import random
+import signal
 import sqlite3
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -13,6 +20,7 @@ from valve_drake import cli
 from valve_drake.analysis import export
 from valve_drake.messages import CameraFrame, Command, HandleMark, HandleMarks, Status
 from valve_drake.recording import foxglove
+from valve_drake.recording.container import active
 from valve_drake.recording.reader import LogReader, recover
 from valve_drake.recording.writer import LogWriter
 
@@ -50,6 +58,17 @@ def test_a_log_gets_its_page_beside_it_and_a_short_word_on_the_terminal(log, cap
     assert code == 0 and err == "" and page.read_text(encoding="utf-8").startswith("<!doctype html>")
     assert "verdict turned" in out and "the log is whole" in out and str(page) in out
     assert "servo (retry 1)" in out
+
+
+def test_a_log_without_truth_has_its_page_its_json_and_its_comparison(log, capsys, tmp_path):
+    blind = sample.write_run(tmp_path / "blind.mcap", without=("/truth",))
+    code, out, err = review(capsys, blind)
+    assert code == 0 and err == "" and "verdict turned" in out and "true" not in out
+    assert "No truth in this log" in blind.with_name("blind.review.html").read_text(encoding="utf-8")
+    code, out, _ = review(capsys, blind, "--json")
+    assert code == 0 and json.loads(out)["angle_true_rad"] is None
+    code, out, _ = review(capsys, blind, log, "--html", tmp_path / "both.html")
+    assert code == 0 and "/truth/" in out
 
 
 def test_html_says_where_the_page_goes_and_links_are_right_from_there(log, capsys, tmp_path):
@@ -185,6 +204,47 @@ def test_export_of_truth_uses_its_names(log, capsys, tmp_path):
 def test_export_from_a_damaged_log_gives_what_there_is_and_3(hurt, capsys, tmp_path):
     code, out, _ = review(capsys, hurt, "--export", "csv", "--topic", "/joint_states", "--out", tmp_path / "j.csv")
     assert code == 3 and "damaged" in out and 0 < len(table(tmp_path / "j.csv")[1]) < 768
+
+
+# ---------------------------------------------------------------- killed runs
+
+RUN = """
+import pathlib, sys
+from valve_drake import runner, scenario
+show = lambda progress: print(progress.sim_time, flush=True)
+runner.run(scenario.load(None, [f"seed={sys.argv[2]}"]), pathlib.Path(sys.argv[1]), show=show)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", range(10))
+def test_a_run_that_is_killed_loses_less_than_a_second_and_can_be_reviewed(k, tmp_path, capsys):
+    """kill -9 at a random moment of the first ten simulated seconds."""
+    rng, path, now = random.Random(k), tmp_path / "run.mcap", 0.0
+    when = rng.uniform(0.6, 10.0)
+    child = subprocess.Popen(
+        [sys.executable, "-c", RUN, path, str(k)], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        while now < when:
+            now = float(child.stdout.readline())
+        time.sleep(rng.uniform(0.0, 0.1))
+        child.kill()
+        reported = [float(line) for line in child.stdout.read().splitlines() if line.count(".") == 1]
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)  # its helpers, if they are left
+        child.wait()
+    now = max([now, *reported])
+    left = LogReader(active(path))
+    with capsys.disabled():
+        print(f" killed at {now:.3f} s, lost {now - left.end:.3f} s", end="", flush=True)
+    assert not path.exists() and now - left.end <= 1.0
+    assert [line for line in left.damage if "breaks off" in line] == left.damage
+    assert review(capsys, active(path))[0] == 3
+    recover(active(path), tmp_path / "whole.mcap")
+    whole = LogReader(tmp_path / "whole.mcap")
+    assert whole.damage == [] and whole.end == left.end
 
 
 # ---------------------------------------------------------------- bad input

@@ -486,6 +486,12 @@ def test_the_deadline_of_turn_grows_with_the_angle():
     assert deadline(CONFIG, State()) == np.inf
 
 
+def test_what_does_not_follow_its_command_is_a_fault():
+    report = SelectorReport(time=0.0, astray=("left_arm",))
+    assert find_fault(CONFIG, 0.0, Health(), report) == "left_arm does not follow the command"
+    assert find_fault(CONFIG, 0.0, Health(), SelectorReport()) == ""
+
+
 def test_ages_are_judged_by_device():
     def fault(device, age):
         health = Health(time=5.0, devices=(device,), ages=np.array([age]))

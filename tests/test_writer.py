@@ -81,7 +81,7 @@ def test_another_reader_finds_all_messages_with_valid_crcs(tmp_path):
     counts, expected = {}, {}
     with open(tmp_path / "a.mcap", "rb") as file:
         reader = make_reader(file, validate_crcs=True)
-        for schema, channel, message in reader.iter_messages():
+        for _, channel, message in reader.iter_messages():
             assert message.log_time == message.publish_time
             assert message.sequence == counts.get(channel.topic, 0)
             counts[channel.topic] = message.sequence + 1

@@ -8,6 +8,10 @@ class ConfigError(ValueError):
     """A scenario, file or argument that cannot be used. Its text is one clear line for the user."""
 
 
+class OperationFailed(RuntimeError):
+    """What was asked for could not be done. Its text is one clear line for the user."""
+
+
 def require(ok: bool, key: str, rule: str, value: object) -> None:
     """Raises ConfigError "<key> must be <rule>, got <value>" unless `ok`."""
     if not ok:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from valve_drake.checks import ConfigError
+from valve_drake.checks import ConfigError, OperationFailed
 
 OK, FAILED, BAD_INPUT, DAMAGED = 0, 1, 2, 3
 
@@ -28,6 +28,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(f"valve-drake: {error}", file=sys.stderr)
         return BAD_INPUT
+    except OperationFailed as error:
+        print(f"valve-drake: {error}", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         print("valve-drake: interrupted", file=sys.stderr)
         return FAILED
@@ -44,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--command", choices=("open", "close"), dest="request", help="what to do with the valve")
     p.add_argument("--log", type=Path, help="the MCAP log (default: logs/run-<seed>.mcap)")
     p.add_argument("--meshcat", action="store_true", help="live 3D view on localhost")
+    p.add_argument("--lockstep", action="store_true", help="station `hardware`: in lock-step with a twin that is, too")
     p.add_argument("--live", action="store_true", help="serve the log's topics to Foxglove, on this machine only")
     p.add_argument("--live-port", type=int, default=8765, metavar="PORT", help="of --live (default: 8765)")
     p.add_argument("--no-html", action="store_true", help="no 3D recording beside the log")
@@ -52,6 +56,15 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--profile", action="store_true", help="print the shares of physics, rendering, stages and logging")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(command=_run)
+
+    p = commands.add_parser("twin", help="the simulated robot as a process of its own, for station `hardware`")
+    p.add_argument("scenario", nargs="?", help="the one that is run (default: hardware.scenario.yaml)")
+    p.add_argument("--seed", type=int, help="draws its world, noise, errors and the chances of its faults")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrides any key of the scenario")
+    p.add_argument("--lockstep", action="store_true", help="waits for the program's every tick, instead of the clock")
+    p.add_argument("--duration", type=float, metavar="SECONDS", help="end after this time (default: with the program)")
+    p.add_argument("--json", action="store_true", help="print one JSON object at the end, with the valve's true angle")
+    p.set_defaults(command=_twin)
 
     p = commands.add_parser("draw", help="wiring list and drawing of a scenario's diagram")
     p.add_argument("scenario", nargs="?")
@@ -150,16 +163,12 @@ def _run(options: argparse.Namespace) -> int:
     from valve_drake import scenario as scenarios
     from valve_drake.runner import run
 
-    overrides = list(options.set)
-    if options.seed is not None:
-        overrides.append(f"seed={options.seed}")
+    overrides = _overrides(options)
     if options.request:
         overrides.append(f"command={options.request}")
-    if options.duration is not None and not (math.isfinite(options.duration) and options.duration > 0):
-        raise ConfigError(f"--duration must be a finite number > 0, got {options.duration}")
     scenario = scenarios.load(options.scenario, overrides)
     log = options.log or Path("logs") / f"run-{scenario.seed}.mcap"
-    html = None if options.no_html else log.with_suffix(".html")
+    html = None if options.no_html or scenario.station == "hardware" else log.with_suffix(".html")
     with _stopper() as stop, _live(options) as live, _display(not options.json) as show:
         result = run(
             scenario,
@@ -187,6 +196,34 @@ def _run(options: argparse.Namespace) -> int:
     if options.duration is not None:
         return OK
     return OK if result.summary.outcome == "done" else FAILED
+
+
+def _overrides(options: argparse.Namespace) -> list[str]:
+    """--set, --seed and --lockstep as overrides; --duration is checked."""
+    overrides = list(options.set)
+    if options.seed is not None:
+        overrides.append(f"seed={options.seed}")
+    if options.lockstep:
+        overrides.append("hardware.lockstep=true")
+    if options.duration is not None and not (math.isfinite(options.duration) and options.duration > 0):
+        raise ConfigError(f"--duration must be a finite number > 0, got {options.duration}")
+    return overrides
+
+
+def _twin(options: argparse.Namespace) -> int:
+    _check_rendering()
+    from valve_drake import scenario as scenarios
+    from valve_drake.rehearsal import run_twin
+
+    scenario = scenarios.load(options.scenario or "hardware.scenario.yaml", _overrides(options))
+    with _stopper() as stop:
+        result = run_twin(scenario, duration=options.duration, stop=stop)
+    if options.json:
+        print(json.dumps(result.as_json()))
+    else:
+        turned = math.degrees(result.valve_end - result.valve_start)
+        print(f"{result.time:.1f} s; the valve was turned by {turned:.2f} deg")
+    return OK
 
 
 @contextlib.contextmanager
@@ -470,7 +507,7 @@ def _draw(options: argparse.Namespace) -> int:
     from valve_drake import drawing, resources
     from valve_drake import scenario as scenarios
 
-    scenario = scenarios.load(options.scenario)
+    scenario = scenarios.load(options.scenario, ["hardware.lcm_url=memq://"])  # to be looked at, not to speak
     name = Path(options.scenario or scenarios.DEFAULT).name.removesuffix(".scenario.yaml")
     for path in drawing.write(scenario, name, options.out or resources.diagrams()):
         print(path)

@@ -9,7 +9,8 @@ import dataclasses as dc
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort
+from pydrake.systems.primitives import Multiplexer
 
 from valve_drake import resources
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
@@ -33,10 +34,13 @@ from valve_drake.perception.line_fitting_system import LineFittingSystem
 from valve_drake.perception.rectangle_estimator_system import RectangleEstimatorSystem
 from valve_drake.perception.stereo_positioning_system import StereoPositioningSystem
 from valve_drake.recording.recorder_system import RecorderSystem
+from valve_drake.recording.signals import JOINED
 from valve_drake.robot_state_system import RobotStateSystem
 from valve_drake.scenario import Scenario
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CONTRACT
+from valve_drake.stations.hardware import RobotLink, make_hardware_station
+from valve_drake.stations.lcm_channels import Bus
 from valve_drake.stations.replay import Recording, make_replay_station
 from valve_drake.stations.simulated import make_simulated_station
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
@@ -119,8 +123,11 @@ def make_station(
     meshcat: Meshcat | None = None,
     recording: Recording | None = None,
     workers: CameraWorkers | None = None,
+    link: RobotLink | None = None,
 ) -> Diagram:
-    """The station that a resolved scenario names; `replay` shows a recording."""
+    """The station that a resolved scenario names; `replay` shows a recording, `hardware` speaks through `link`."""
+    if scenario.station == "hardware":
+        return make_hardware_station(RobotLink(Bus(scenario.hardware)) if link is None else link)
     if scenario.station == "replay":
         if recording is None:
             raise ConfigError("station replay needs a log: valve-drake replay LOG")
@@ -174,14 +181,15 @@ def make_diagram(
     meshcat: Meshcat | None = None,
     recording: Recording | None = None,
     workers: CameraWorkers | None = None,
+    link: RobotLink | None = None,
     truth: bool = True,
 ) -> System:
-    """The whole system for a resolved scenario; `recording` is what station `replay` shows.
+    """The whole system for a resolved scenario; `recording` is what station `replay` shows, `link` leads to a robot.
 
     workers: make the simulated cameras' images beside the run. truth=False leaves the recorder without the `truth.*` ports.
     """
     builder = DiagramBuilder()
-    station = builder.AddSystem(make_station(scenario, meshcat, recording, workers))
+    station = builder.AddSystem(make_station(scenario, meshcat, recording, workers, link))
     station.set_name("station")  # whichever it is: the wiring is the same
     blocks = {block.get_name(): block for block in make_blocks(scenario)}
     for block in blocks.values():
@@ -200,14 +208,19 @@ def make_diagram(
 
 
 def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems: dict, truth: bool) -> None:
-    """Every port of the recorder is named after what it records: a station's port, a command, or block.port."""
+    """Every port of the recorder is named after what it records: a station's port, a command, block.port, or JOINED."""
     station = systems["station"]
     exported = {station.get_output_port(k).get_name() for k in range(station.num_output_ports())}
     commands = {spec.name for spec in CONTRACT if spec.direction == "in"}
-    for k in range(recorder.num_input_ports()):
-        port = recorder.get_input_port(k)
-        name = port.get_name()
-        if name == "operator.command":
+
+    def connect(name: str, port: InputPort) -> None:
+        if name in JOINED:
+            parts = JOINED[name]
+            join = builder.AddNamedSystem(name, Multiplexer([len(values) for values in parts.values()]))
+            for k, part in enumerate(parts):
+                connect(part, join.get_input_port(k))
+            builder.Connect(join.get_output_port(), port)
+        elif name == "operator.command":
             builder.ConnectInput(OPERATOR, port)
         elif name in exported:
             if truth or not name.startswith("truth."):
@@ -217,6 +230,10 @@ def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems
         elif not name.startswith("truth."):
             block, output = name.split(".", 1)
             builder.Connect(systems[block].GetOutputPort(output), port)
+
+    for k in range(recorder.num_input_ports()):
+        port = recorder.get_input_port(k)
+        connect(port.get_name(), port)
 
 
 def command(system: System, context: object, request: OperatorCommand) -> None:

@@ -5,12 +5,14 @@
 
 import contextlib
 import dataclasses as dc
+import gc
 import importlib.metadata
 import json
 import platform
 import subprocess
+import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -25,7 +27,8 @@ from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError, require
 from valve_drake.diagram import System, command, make_diagram
 from valve_drake.messages import Mode, ModeState, OperatorCommand
-from valve_drake.ports import TICK, profile
+from valve_drake.pace import Pace, Pacer
+from valve_drake.ports import SLOT, TICK, profile
 from valve_drake.recording import layout
 from valve_drake.recording.container import active
 from valve_drake.recording.reader import LogReader
@@ -35,12 +38,16 @@ from valve_drake.recording.signals import signals
 from valve_drake.recording.writer import LogError, LogWriter
 from valve_drake.scenario import Scenario, dump, parse, resolve, with_overrides
 from valve_drake.stations.camera_workers import CameraWorkers
+from valve_drake.stations.hardware import RobotLink
+from valve_drake.stations.lcm_channels import Bus
 from valve_drake.stations.replay import Recording
 
 STEP = 1 / 32  # between two looks at the mode [s]
 TAIL = 1.5  # recorded after the end: a stopped base takes a second to stand [s]
 TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
-RECORDED = ("seed", "station", "command", "angle", "time_limit", "simulation")  # keys that a replay cannot change
+FILES = {key: f"{key}.yaml" for key in ("head_calibration", "taught")}  # that a scenario names, as attached to its log
+WORLD = ("simulation", "hardware", "faults")
+RECORDED = ("seed", "station", "command", "angle", "time_limit", *WORLD)  # keys that a replay cannot change
 
 
 @dc.dataclass(frozen=True)
@@ -63,6 +70,7 @@ class Result:
     log_error: str
     shares: dict[str, float]  # of the wall time, by kind of work; of rendering, what the run waited for
     beside: float  # processor time of rendering beside the run [s]
+    pace: Pace | None  # how real time was kept, where it was
 
     def as_json(self) -> dict:
         """The object of `run --json`."""
@@ -86,6 +94,7 @@ class Result:
             "turn_share_left": s.turn_share_left,
             "shares": {kind: round(share, 4) for kind, share in self.shares.items()},
             "rendering_beside_s": self.beside,
+            "pace": self.pace and self.pace.as_json(),
             "log": str(self.log),
             "log_error": self.log_error,
             "recording": str(self.html) if self.html else None,
@@ -127,13 +136,15 @@ def run(
     truth: bool = True,
     duration: float | None = None,
     live: Sink | None = None,
+    link: RobotLink | None = None,
     show: Callable[[Progress], None] = lambda progress: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Result:
     """Runs a scenario (distributions and all) and writes its log.
 
     html: where to put the 3D recording. meshcat_port: also serve it live there. truth: record the truth ports.
-    duration: stop then, whatever the mode [s]. live: also gets all that is logged. show: called every STEP.
+    duration: stop then, whatever the mode [s]. live: also gets all that is logged. link: to the robot of
+    station `hardware`, else made of the scenario. show: called every STEP.
     stop: True makes the operator's stop.
     """
     scenario = resolve(scenario)
@@ -141,21 +152,27 @@ def run(
     require(scenario.station != "replay", "station", "one that runs (a log is replayed by `replay LOG`)", "replay")
     cv2.setNumThreads(1)  # the same bits on any machine, and the renderer wants the cores
     meshcat = None
+    if scenario.station == "hardware":
+        html = meshcat_port = None  # the simulation's views: a robot is looked at itself
+        link = link or RobotLink(Bus(scenario.hardware))
     if html is not None or meshcat_port is not None:
         meshcat = Meshcat(MeshcatParams(host="localhost", port=meshcat_port))
         meshcat.SetCameraPose(np.array([-3.0, -2.6, 2.3]), np.array([-0.6, 0.0, 0.9]))
     profile.clear()
     writer = LogWriter(log)
     with _log_kept(writer), CameraWorkers() as workers:
-        _begin_log(writer, scenario)
+        _begin_log(writer, scenario, scenario)
         sink = writer if live is None else Tee(writer, live)
         recorder = make_recorder(sink, scenario)
-        system = make_diagram(scenario, recorder, meshcat=meshcat, workers=workers, truth=truth)
+        system = make_diagram(scenario, recorder, meshcat=meshcat, workers=workers, link=link, truth=truth)
         simulator = Simulator(system.diagram)
         if html is not None:
             meshcat.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat_port is not None)
         begin = time.perf_counter()
-        mode = _advance(system, simulator, scenario, duration, show, stop, begin)
+        paced = scenario.station == "hardware" and not scenario.hardware.lockstep
+        pacer = Pacer(idle=link.pass_time) if paced else None
+        go = simulator.AdvanceTo if pacer is None else _in_real_time(simulator, pacer, sink)
+        mode = _advance(system, simulator, scenario, duration, go, link, show, stop, begin)
         wall = time.perf_counter() - begin
         writer.write_metadata("result", _result_metadata(mode, simulator.get_context().get_time()))
     if html is not None:
@@ -165,14 +182,18 @@ def run(
     shares = {kind: seconds / wall for kind, seconds in profile.seconds.items()}
     shares["physics"] = 1.0 - sum(shares.values())
     written = log if not writer.error else active(log)
-    return Result(summarize(written), wall, written, html, writer.error, shares, profile.beside)
+    pace = pacer and pacer.report(mode.time)
+    return Result(summarize(written), wall, written, html, writer.error, shares, profile.beside, pace)
 
 
-def _begin_log(writer: LogWriter, scenario: Scenario, **facts: str) -> None:
-    """What every log begins with."""
+def _begin_log(writer: LogWriter, scenario: Scenario, files: Scenario, **facts: str) -> None:
+    """What every log begins with; `files` names the files to attach."""
     about = {"scenario": dump(scenario), "seed": str(scenario.seed), "station": scenario.station}
     writer.write_metadata("run", about | versions() | facts)
     writer.attach(layout.NAME, layout.MEDIA_TYPE, json.dumps(layout.layout(), indent=1).encode())
+    for key, name in FILES.items():
+        data = resources.find(getattr(files, key), resources.models()).read_bytes()
+        writer.attach(name, "application/yaml", data)
 
 
 @contextlib.contextmanager
@@ -190,10 +211,13 @@ def _advance(
     simulator: Simulator,
     scenario: Scenario,
     duration: float | None,
+    go: Callable[[float], object],
+    link: RobotLink | None,
     show: Callable[[Progress], None],
     stop: Callable[[], bool],
     begin: float,
 ) -> ModeState:
+    """go: advances the simulator to a time."""
     context = simulator.get_mutable_context()
     command(system, context, OperatorCommand(sequence=0, command=scenario.command, angle=scenario.angle))
     simulator.Initialize()
@@ -205,14 +229,38 @@ def _advance(
         now = context.get_time()
         mode = port.Eval(inner)
         show(Progress(mode, now, time.perf_counter() - begin))
+        if link is not None:
+            link.tell(mode.mode, mode.activation)
         if mode.mode in TERMINAL and duration is None:
             end = min(end, mode.since + TAIL)
         if now >= end:
+            if link is not None:
+                link.leave()
             return mode
         if stop() and not stopped:
             stopped = True
             command(system, context, OperatorCommand(sequence=1, command="stop"))
-        simulator.AdvanceTo(min(now + STEP, end))
+        go(min(now + STEP, end))
+
+
+def _in_real_time(simulator: Simulator, pacer: Pacer, sink: Sink) -> Callable[[float], None]:
+    """AdvanceTo, held to the wall's clock tick by tick. A tick ends with its commands, in slot 3, where the next one's
+    reports are read: it advances to there, so that its work is done in one go."""
+    gc.collect()
+    gc.freeze()  # what is there stays: a collection that looks at it all would take several ticks
+    context = simulator.get_context()
+
+    def go(until: float) -> None:
+        while True:
+            tick = int(context.get_time() / TICK + 1 / 4) * TICK
+            pacer.tick(lambda end=tick + 3 * SLOT: simulator.AdvanceTo(end))
+            now = context.get_time()
+            if int(tick) != int(tick + TICK):
+                sink.write("/pace", pacer.report(now), now)
+            if now + TICK > until + SLOT:
+                return
+
+    return go
 
 
 def _result_metadata(mode: ModeState, sim_time: float) -> dict[str, str]:
@@ -284,7 +332,8 @@ def replay(
     Raises ConfigError if this version of the program cannot replay the log, LogError if `copy` cannot be written.
     """
     recorded = _recorded_scenario(log)
-    for key in (override.partition("=")[0].strip() for override in overrides):
+    changed = [override.partition("=")[0].strip() for override in overrides]
+    for key in changed:
         if key.partition(".")[0] in RECORDED:
             raise ConfigError(f"--set {key}: it is recorded; a replay can change the blocks' keys only")
     scenario = with_overrides(dc.replace(recorded, station="replay"), overrides)
@@ -292,21 +341,22 @@ def replay(
     cv2.setNumThreads(1)  # as in the run
     comparison = Comparison(log, recording.end)
     with contextlib.ExitStack() as stack:
+        files = stack.enter_context(_files_of(log, scenario, changed))
         sink: Sink = comparison
         writer = None
         if copy is not None:
             require(copy.resolve() != log.path.resolve(), "--log", "another file than the log itself", str(copy))
             writer = stack.enter_context(LogWriter(copy))
-            _begin_log(writer, scenario, replay_of=log.path.name)
+            _begin_log(writer, scenario, files, replay_of=log.path.name)
             sink = Tee(comparison, writer)
-        system = make_diagram(scenario, make_recorder(sink, scenario), recording=recording)
+        system = make_diagram(files, make_recorder(sink, files), recording=recording)
         begin = time.perf_counter()
         mode = _feed(system, Simulator(system.diagram), recording, show, begin)
         comparison.finish()
         wall = time.perf_counter() - begin
         if writer is not None:
             writer.write_metadata("result", _result_metadata(mode, recording.end))
-    return Replay(comparison, recording.end, wall, log.damage, _notes(log, recorded, recording))
+    return Replay(comparison, recording.end, wall, log.damage, _notes(log, recorded, recording, changed))
 
 
 def _recorded_scenario(log: LogReader) -> Scenario:
@@ -314,6 +364,18 @@ def _recorded_scenario(log: LogReader) -> Scenario:
     if text is None:
         raise ConfigError(f"{log.path} cannot be replayed: it does not hold its scenario")
     return parse(text, str(log.path))
+
+
+@contextlib.contextmanager
+def _files_of(log: LogReader, scenario: Scenario, changed: Collection[str]) -> Iterator[Scenario]:
+    """The scenario with the log's own files, but for those whose keys are `changed`."""
+    with tempfile.TemporaryDirectory() as folder:
+        paths = {}
+        for key, name in FILES.items():
+            if key not in changed and name in log.attachments:
+                paths[key] = Path(folder) / name
+                paths[key].write_bytes(log.attachments[name].data)
+        yield dc.replace(scenario, **{key: str(path) for key, path in paths.items()})
 
 
 def _feed(
@@ -339,12 +401,14 @@ def _feed(
     return port.Eval(inner)
 
 
-def _notes(log: LogReader, recorded: Scenario, recording: Recording) -> list[str]:
+def _notes(log: LogReader, recorded: Scenario, recording: Recording, changed: Collection[str]) -> list[str]:
     """What is not as it was when the log was written, and what of it is not replayed."""
     facts, now = log.metadata["run"], versions()
     notes = [f"{name} was {facts[name]}, is {now[name]}" for name in now if facts.get(name, now[name]) != now[name]]
     if dump(recorded) != facts["scenario"]:
         notes.append("the log's scenario lacks keys of this program: their defaults stand in")
+    for key in (key for key, name in FILES.items() if key not in changed and name not in log.attachments):
+        notes.append(f"the log does not hold its {key}: {getattr(recorded, key)} of today stands in")
     if recording.end < log.end:
         notes.append(f"replayed up to t = {recording.end:.3f} s: after that the log is incomplete")
     return notes

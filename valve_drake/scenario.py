@@ -30,13 +30,15 @@ from valve_drake.perception.line_fitting import LineFittingConfig
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig
+from valve_drake.stations.faults import FaultConfig
+from valve_drake.stations.lcm_channels import HardwareConfig
 from valve_drake.stations.simulation_config import SimulationConfig, Uniform
 from valve_drake.supervisor.command_selector import CommandSelectorConfig
 from valve_drake.supervisor.supervisor import SupervisorConfig
 
 PLATE = 0.15  # the valve's face that carries the marker, square [m]
 DEFAULT = "simulated.scenario.yaml"
-STATIONS = ("simulated", "replay")
+STATIONS = ("simulated", "hardware", "replay")
 
 
 @dc.dataclass
@@ -65,6 +67,8 @@ class Scenario:
     supervisor: SupervisorConfig = dc.field(default_factory=SupervisorConfig)
     command_selector: CommandSelectorConfig = dc.field(default_factory=CommandSelectorConfig)
     simulation: SimulationConfig = dc.field(default_factory=SimulationConfig)
+    hardware: HardwareConfig = dc.field(default_factory=HardwareConfig)
+    faults: list[FaultConfig] = dc.field(default_factory=list)  # of the twin
 
     def check(self) -> None:
         """Raises ConfigError that names the key, the rule and the value."""
@@ -77,8 +81,9 @@ class Scenario:
             require(length <= PLATE, "marker.size", f"not larger than the panel's face of {PLATE} m", self.marker.size)
         for field in dc.fields(self):
             value = getattr(self, field.name)
-            if dc.is_dataclass(value):
-                value.check()
+            for part in value if isinstance(value, list) else [value]:
+                if dc.is_dataclass(part):
+                    part.check()
 
 
 def load(path: str | None = None, overrides: typing.Sequence[str] = ()) -> Scenario:

@@ -26,6 +26,7 @@ LIBRARY = "valve_drake"
 _HEAD = struct.Struct("<BQ")  # opcode, length of the body
 _MESSAGE = struct.Struct("<BQHIQQ")  # the same, channel, sequence, log time, publish time
 _MESSAGE_HEAD = _MESSAGE.size - _HEAD.size
+_OPCODE = int(Opcode.MESSAGE)
 
 
 class Chunk:
@@ -33,24 +34,23 @@ class Chunk:
 
     def __init__(self) -> None:
         self.definitions: list[records.Schema | records.Channel] = []
-        self.index: dict[int, list[int]] = {}  # channel -> time, offset, time, offset, ...
+        self.index: dict[int, list[int]] = collections.defaultdict(list)  # channel -> time, offset, time, offset, ...
         self.parts: list[bytes] = []
         self.size = 0
 
     def define(self, definition: records.Schema | records.Channel) -> None:
         """Adds a schema or channel, right before its first message."""
         self.definitions.append(definition)
-        self._append(_bytes_of(definition))
+        data = _bytes_of(definition)
+        self.parts.append(data)
+        self.size += len(data)
 
     def add(self, channel: int, when: int, sequence: int, data: bytes) -> None:
         """Adds a message; `when` [ns]."""
-        self.index.setdefault(channel, []).extend((when, self.size))
-        self._append(_MESSAGE.pack(Opcode.MESSAGE, _MESSAGE_HEAD + len(data), channel, sequence, when, when))
-        self._append(data)
-
-    def _append(self, part: bytes) -> None:
-        self.parts.append(part)
-        self.size += len(part)
+        self.index[channel] += (when, self.size)
+        length = len(data)
+        self.parts += (_MESSAGE.pack(_OPCODE, _MESSAGE_HEAD + length, channel, sequence, when, when), data)
+        self.size += _MESSAGE.size + length
 
 
 class McapFile:

@@ -4,6 +4,7 @@ Frames agree with the viewers' (cameras: x right, y down, z forward). Pixels do 
 of the first pixel, in annotations its top-left corner. Half a pixel is added in this file and nowhere else.
 """
 
+import functools
 import math
 from collections.abc import Iterable
 
@@ -33,6 +34,8 @@ from valve_drake.messages import (
     Segmentation,
     Status,
 )
+from valve_drake.recording.refilled import STAMP, Refilled, slot
+from valve_drake.recording.schemas import Encoded
 
 NANO = 1_000_000_000
 ACCEPTED = Color(r=0.0, g=0.9, b=1.0, a=1.0)
@@ -75,16 +78,29 @@ def calibration(camera: str, time: float, size: tuple[int, int], K: np.ndarray) 
 
 def quaternions(R: np.ndarray) -> np.ndarray:
     """Rotation matrices (n, 3, 3) as unit quaternions x, y, z, w (n, 4)."""
-    M = np.empty((len(R), 4, 4))  # 4 q q^T
-    M[:, :3, :3] = R + R.transpose(0, 2, 1)
+    M = (R.reshape(-1, 9) @ _TO_SQUARE + np.eye(4).ravel()).reshape(-1, 4, 4)
+    q = M[np.arange(len(M)), M[:, range(4), range(4)].argmax(axis=1)]  # of the largest component: never ill-conditioned
+    return q / np.sqrt((q * q).sum(axis=1, keepdims=True))
+
+
+def _to_square() -> np.ndarray:
+    """(9, 16) that makes 4 q q^T - 1 of a rotation matrix, both row by row."""
+    out = np.zeros((3, 3, 4, 4))
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
-        M[:, 3, k] = M[:, k, 3] = R[:, j, i] - R[:, i, j]
-        M[:, k, k] = 1 + R[:, k, k] - R[:, i, i] - R[:, j, j]
-    M[:, 3, 3] = 1 + np.trace(R, axis1=1, axis2=2)
-    rows = np.arange(len(R))
-    q = M[rows, np.argmax(M[:, range(4), range(4)], axis=1)]  # the row of the largest component: never ill-conditioned
-    return q / np.sqrt((q * q).sum(axis=1, keepdims=True))
+        for a in range(3):
+            out[a, k, a, k] += 1
+            out[k, a, a, k] += 1
+        out[j, i, 3, k] = out[j, i, k, 3] = 1
+        out[i, j, 3, k] = out[i, j, k, 3] = -1
+        out[i, i, k, k] -= 1
+        out[j, j, k, k] -= 1
+        out[k, k, k, k] -= 1
+        out[k, k, 3, 3] = 1
+    return out.reshape(9, 16)
+
+
+_TO_SQUARE = _to_square()
 
 
 def pose(X: np.ndarray) -> Pose:
@@ -94,26 +110,23 @@ def pose(X: np.ndarray) -> Pose:
     return Pose(position=Vector3(x=px, y=py, z=pz), orientation=Quaternion(x=x, y=y, z=z, w=w))
 
 
-def transforms(
-    time: float, tree: Iterable[tuple[str, str, np.ndarray]], message: FrameTransforms | None = None
-) -> FrameTransforms:
-    """Poses X (3, 4) of child frames in their parents, as (parent, child, X), valid at `time`.
+def transforms(time: float, tree: Iterable[tuple[str, str, np.ndarray]]) -> Encoded:
+    """FrameTransforms: poses X (3, 4) of child frames in their parents, as (parent, child, X), valid at `time`."""
+    parents, children, poses = zip(*tree)
+    X = np.array(poses)
+    numbers = np.hstack([X[:, :, 3], quaternions(X[:, :, :3])])
+    return _tree(parents, children).fill(nanoseconds(time), numbers.ravel().tolist())
 
-    `message`: one to fill again, which is faster than a new one.
-    """
-    message, now, tree = message or FrameTransforms(), stamp(time), list(tree)
-    del message.transforms[len(tree) :]
-    while len(message.transforms) < len(tree):
-        message.transforms.add()
-    poses = np.array([X for _, _, X in tree]).reshape(-1, 3, 4)
-    positions, rotations = poses[:, :, 3].tolist(), quaternions(poses[:, :, :3]).tolist()
-    for at, (parent, child, _), p, q in zip(message.transforms, tree, positions, rotations):
-        at.timestamp.CopyFrom(now)
-        at.parent_frame_id, at.child_frame_id = parent, child
-        t, r = at.translation, at.rotation
-        t.x, t.y, t.z = p
-        r.x, r.y, r.z, r.w = q
-    return message
+
+@functools.cache
+def _tree(parents: tuple[str, ...], children: tuple[str, ...]) -> Refilled:
+    """The form of a FrameTransforms; seven numbers a frame."""
+    form = FrameTransforms()
+    for k, (parent, child) in enumerate(zip(parents, children)):
+        x, y, z, qx, qy, qz, qw = (slot(7 * k + n) for n in range(7))
+        p, q = Vector3(x=x, y=y, z=z), Quaternion(x=qx, y=qy, z=qz, w=qw)
+        form.transforms.add(timestamp=STAMP, parent_frame_id=parent, child_frame_id=child, translation=p, rotation=q)
+    return Refilled(form, 7 * len(parents))
 
 
 def estimated_pose(camera: str, estimate: RectangleEstimate) -> PoseInFrame | None:

@@ -1,6 +1,6 @@
 """The log's channels served live to Foxglove over its WebSocket: a sink for the recorder, beside the log's writer.
 
-Only what somebody looks at is encoded and sent. A new subscriber gets the topic's last message at once, so that the
+Only what somebody looks at is sent. A new subscriber gets the topic's last message at once, so that the
 scene and the calibrations, which are rare, are there wherever one tunes in. The server never holds up the loop: a
 client that is too slow loses messages.
 """
@@ -11,7 +11,6 @@ from typing import Any, Self
 from google.protobuf.message import Message as Proto
 
 from valve_drake.checks import ConfigError
-from valve_drake.messages import Message
 from valve_drake.recording import schemas
 from valve_drake.recording.foxglove import NANO, nanoseconds
 
@@ -39,7 +38,7 @@ class LiveView:
         self._foxglove = foxglove
         self._context = foxglove.Context()
         self._channels: dict[str, Any] = {}
-        self._last: dict[str, tuple[Message | bytes, int]] = {}  # topic -> message, when [ns]
+        self._last: dict[str, tuple[bytes, int]] = {}  # topic -> message, when [ns]
         self._clock = -CLOCK_PERIOD
         try:
             self._server = foxglove.start_server(
@@ -57,18 +56,17 @@ class LiveView:
     def port(self) -> int:
         return self._server.port
 
-    def write(self, topic: str, message: Message | Proto, time: float) -> None:
+    def write(self, topic: str, message: schemas.Loggable, time: float) -> None:
         """Sends a message of `topic` at `time` [s] to those who have subscribed to it."""
         when = nanoseconds(time)
         if when - self._clock >= CLOCK_PERIOD:
             self._clock = when
             self._server.broadcast_time(when)
-        channel = self._channels.get(topic) or self._define(topic, type(message))
-        # A Message never changes; a protobuf message is filled again by its maker.
-        kept = message if isinstance(message, Message) else message.SerializeToString()
-        self._last[topic] = kept, when
+        kind, data = schemas.serialized(message)
+        channel = self._channels.get(topic) or self._define(topic, kind)
+        self._last[topic] = data, when
         if channel.has_sinks():
-            channel.log(_encoded(kept), log_time=when)
+            channel.log(data, log_time=when)
 
     def flush(self) -> None:
         """Nothing is kept back."""
@@ -84,10 +82,9 @@ class LiveView:
     ) -> None:
         self.close()
 
-    def _define(self, topic: str, kind: type) -> Any:
-        proto = schemas.proto_class(kind) if issubclass(kind, Message) else kind
+    def _define(self, topic: str, kind: type[Proto]) -> Any:
         schema = self._foxglove.Schema(
-            name=proto.DESCRIPTOR.full_name, encoding="protobuf", data=schemas.schema_data(proto)
+            name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=schemas.schema_data(kind)
         )
         channel = self._foxglove.Channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
         self._channels[topic] = channel
@@ -96,9 +93,5 @@ class LiveView:
     def _repeat(self, topic: str) -> None:
         """Called by the server's thread."""
         if topic in self._last and topic in self._channels:
-            kept, when = self._last[topic]
-            self._channels[topic].log(_encoded(kept), log_time=when)
-
-
-def _encoded(kept: Message | bytes) -> bytes:
-    return kept if isinstance(kept, bytes) else schemas.encode(kept)
+            data, when = self._last[topic]
+            self._channels[topic].log(data, log_time=when)

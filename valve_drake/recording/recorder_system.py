@@ -1,17 +1,17 @@
 """The recorder: whatever its table names, from a port through an encoder to a topic of the log."""
 
 import dataclasses as dc
+import functools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
-from google.protobuf.message import Message as Proto
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, InputPort, LeafSystem
 
-from valve_drake.messages import Message
 from valve_drake.ports import TICK, Kind, profile
+from valve_drake.recording.schemas import Loggable, serialized
 
 ONCE = math.inf  # a period: at the start only
 
@@ -19,7 +19,7 @@ ONCE = math.inf  # a period: at the start only
 class Sink(Protocol):
     """Where the recorder writes: writer.LogWriter, or a live view."""
 
-    def write(self, topic: str, message: Message | Proto, time: float) -> None: ...
+    def write(self, topic: str, message: Loggable, time: float) -> None: ...
 
     def flush(self) -> None: ...
 
@@ -30,7 +30,7 @@ class Tee:
     def __init__(self, *sinks: Sink):
         self._sinks = sinks
 
-    def write(self, topic: str, message: Message | Proto, time: float) -> None:
+    def write(self, topic: str, message: Loggable, time: float) -> None:
         for sink in self._sinks:
             sink.write(topic, message, time)
 
@@ -50,7 +50,7 @@ class Signal:
 
     topic: str
     inputs: Mapping[str, Kind]  # port -> message class, or size of the vector
-    encode: Callable[..., Message | Proto | None]  # (time, *values) -> what to write; None: nothing
+    encode: Callable[..., Loggable | None]  # (time, *values) -> what to write; None: nothing
     period: float = TICK  # [s] a multiple of TICK, or ONCE
     key: Callable[..., Any] | None = None
     urgent: bool = False  # brought to the disk at once
@@ -74,7 +74,9 @@ class RecorderSystem(LeafSystem):
         self._sink = sink
         self._ports: dict[str, _Port] = {}
         self._rows = [_Row(signal, [self._declare(*port) for port in signal.inputs.items()]) for signal in signals]
-        self._publishes = 0
+        self._periods = sorted({row.every for row in self._rows})
+        self._begun = False
+        self._due = functools.cache(self._find_due)
         self.DeclarePeriodicPublishEvent(TICK, 0.0, self._publish)
 
     def _declare(self, name: str, kind: Kind) -> "_Port":
@@ -90,44 +92,52 @@ class RecorderSystem(LeafSystem):
 
     def _publish(self, context: Context) -> None:
         with profile("logging"):
-            if self._publishes == 0:
+            if not self._begun:
+                self._begun = True
                 self._rows = [row for row in self._rows if all(port.connected(context) for port in row.ports)]
-            self._publishes += 1
             time = context.get_time()
             tick = round(time / TICK)
-            for row in self._rows:
-                if row.due(tick) and (values := row.news(context, self._publishes)) is not None:
+            rows, ports = self._due(*(tick % every == 0 for every in self._periods))
+            for port in ports:
+                port.read(context)
+            for row in rows:
+                if row.watched and row.watched.value is row.seen:
+                    continue  # most rows at most ticks, so it is asked without a call
+                if (values := row.news()) is not None:
                     self._write(row.signal, time, values)
+
+    def _find_due(self, *periods: bool) -> tuple[list["_Row"], list["_Port"]]:
+        """The rows whose periods are due, and their ports."""
+        due = {every for every, now in zip(self._periods, periods) if now}
+        rows = [row for row in self._rows if row.every in due]
+        return rows, list(dict.fromkeys(port for row in rows for port in row.ports))
 
     def _write(self, signal: Signal, time: float, values: list) -> None:
         message = signal.encode(time, *values)
         if message is not None:
-            self._sink.write(signal.topic, message, time)
+            self._sink.write(signal.topic, serialized(message), time)  # once, however many sinks there are
             if signal.urgent:
                 self._sink.flush()
 
 
 class _Port:
-    """An input port, evaluated once in every publish however many rows read it."""
+    """An input port, and its value at the last publish that had a row for it."""
 
     def __init__(self, port: InputPort, kind: Kind):
         self.kind = kind
+        self.value: Any = None
         self._port = port
         self._type = np.ndarray if isinstance(kind, int) else kind
-        self._read_at = 0
-        self._value: Any = None
 
     def connected(self, context: Context) -> bool:
         return self._port.HasValue(context)
 
-    def read(self, context: Context, publish: int) -> Any:
-        if self._read_at != publish:
-            self._read_at, self._value = publish, self._port.Eval(context)
-            if not isinstance(self._value, self._type):
-                # Connect() cannot check this: Drake sees every Python message as Value[object].
-                found = type(self._value).__name__
-                raise TypeError(f"{self._port.GetFullDescription()}: want {self._type.__name__}, got {found}")
-        return self._value
+    def read(self, context: Context) -> None:
+        self.value = self._port.Eval(context)
+        if not isinstance(self.value, self._type):
+            # Connect() cannot check this: Drake sees every Python message as Value[object].
+            found = type(self.value).__name__
+            raise TypeError(f"{self._port.GetFullDescription()}: want {self._type.__name__}, got {found}")
 
 
 class _Row:
@@ -138,19 +148,21 @@ class _Row:
             raise ValueError(f"{signal.topic}: the period must be a multiple of {TICK} s, got {signal.period}")
         self.signal = signal
         self.ports = ports
-        self._every = 0 if signal.period == ONCE else round(signal.period / TICK)  # [ticks]
+        self.every = ONCE if signal.period == ONCE else round(signal.period / TICK)  # [ticks]; 0 % ONCE is 0
+        self.watched = ports[0] if len(ports) == 1 and not isinstance(ports[0].kind, int) else None
+        self.seen: Any = None  # of the port that is watched
         self._key = signal.key
-        self._always = signal.key is None and all(isinstance(kind, int) for kind in signal.inputs.values())
+        self._always = signal.key is None and all(isinstance(port.kind, int) for port in ports)
         self._last: Any = None
 
-    def due(self, tick: int) -> bool:
-        return tick % self._every == 0 if self._every else self._last is None
-
-    def news(self, context: Context, publish: int) -> list | None:
+    def news(self) -> list | None:
         """The values to write, if any. Messages compare by identity."""
-        values = [port.read(context, publish) for port in self.ports]
-        mark = values if self._key is None else self._key(*values)
-        if not self._always and mark == self._last:
-            return None
-        self._last = mark
+        values = [port.value for port in self.ports]
+        if self.watched:
+            self.seen = self.watched.value
+        if not self._always:
+            mark = values if self._key is None else self._key(*values)
+            if mark == self._last:
+                return None
+            self._last = mark
         return values

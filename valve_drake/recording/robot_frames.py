@@ -6,8 +6,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from valve_drake.behaviors.grasp_geometry import turned
 from valve_drake.camera.lens import StereoHead
-from valve_drake.frames import compose, inverse, make, planar
-from valve_drake.kinematics import GEOMETRY
+from valve_drake.frames import compose, make, planar
 from valve_drake.messages import SIDES, GraspPlan, RectangleEstimate, RobotState, TurnState
 from valve_drake.perception.marker import Marker
 from valve_drake.recording.scene import parts_of, scene
@@ -28,9 +27,14 @@ class RobotFrames:
         self._plant.Finalize()
         self._diagram = builder.Build()
         self._context = self._plant.CreateDefaultContext()
-        self._bodies = [self._plant.get_body(i) for i in self._plant.GetBodyIndices(robot)]
-        self._head = head
-        self._marker = marker
+        self._poses = self._plant.get_body_poses_output_port()
+        self._bodies = {int(i): f"robot::{self._plant.get_body(i).name()}" for i in self._plant.GetBodyIndices(robot)}
+        eye = self._plant.GetFrameByName("head_left_camera", robot)
+        self._constant = [
+            (f"robot::{eye.body().name()}", "head_left", eye.GetFixedPoseInBodyFrame().GetAsMatrix34()),
+            ("head_left", "head_right", head.X_LR),
+        ]
+        self._X_VWheel = make(np.eye(3), np.array([0.0, 0.0, marker.panel_depth]))
         self.scene = scene(parts_of(scene_graph.model_inspector()))
         self._slots = {
             "base": [self._slot(n) for n in ("base_x", "base_y", "base_yaw")],
@@ -51,26 +55,20 @@ class RobotFrames:
             q[self._slots[side]] = getattr(state, f"{side}_arm")
             q[self._fingers[side]] = getattr(state, f"{side}_gripper") / 2
         self._plant.SetPositions(self._context, q)
-        out = [
-            (ODOMETRY, f"robot::{body.name()}", self._plant.EvalBodyPoseInWorld(self._context, body).GetAsMatrix34())
-            for body in self._bodies
-        ]
-        X_OL = GEOMETRY.head_pose(state.odometry[:3], state.torso)
-        out += [(ODOMETRY, "head_left", X_OL), ("head_left", "head_right", self._head.X_LR)]
-        X_OV = None
+        X_WB = self._poses.Eval(self._context)  # of all bodies
+        out = [(ODOMETRY, name, X_WB[i].GetAsMatrix34()) for i, name in self._bodies.items()] + self._constant
         if plan.found:
-            X_OV = turned(compose(planar(*state.odometry[:3]), plan.X_BV), turn.angle)
+            X_OV = compose(planar(*state.odometry[:3]), plan.X_BV)
         elif estimate.found:
             X_OV = compose(estimate.X_OL, estimate.X_LV)
-        if X_OV is not None:
-            back = make(np.eye(3), np.array([0.0, 0.0, -self._marker.panel_depth]))
-            X_OWheel = compose(X_OV, inverse(back))
-            out += [
-                (ODOMETRY, "marker", X_OV),
-                (ODOMETRY, "valve::wheel", X_OWheel),
-                (ODOMETRY, "valve::panel", X_OWheel),
-            ]
-        return out
+        else:
+            return out
+        X_OMarker = turned(X_OV, turn.angle) if plan.found else X_OV
+        return out + [
+            (ODOMETRY, "marker", X_OMarker),
+            ("marker", "valve::wheel", self._X_VWheel),
+            (ODOMETRY, "valve::panel", compose(X_OV, self._X_VWheel)),
+        ]
 
 
 def pinholes(head: StereoHead) -> dict[str, tuple[tuple[int, int], np.ndarray]]:

@@ -1,21 +1,20 @@
 """The recorder's table: every topic of a log, and the makers of its rows.
 
-    /<block>/<port>           a block's output as it is (schemas.py)
-    /<camera>/image           foxglove.CompressedImage: the bytes that the program decoded, of images that it looked at
-    /<camera>/calibration     foxglove.CameraCalibration     /<camera>/detections   foxglove.ImageAnnotations
-    /tf  /scene               foxglove.FrameTransforms, SceneUpdate
-    /joint_states  /joint_commands   foxglove.JointStates of the station's measured and commanded vectors
-    /<side>_wrist/wrench      schemas.Wrench, as the sensor gives it
-    /events  /log             foxglove.Event, foxglove.Log
-    /health  /operator/command   the station's and the operator's messages
-    /truth/...                schemas.Vector: simulation only; left out when the ports are not connected
+/<block>/<port>           a block's output as it is (schemas.py)
+/<camera>/image           foxglove.CompressedImage: the bytes that the program decoded, of images that it looked at
+/<camera>/calibration     foxglove.CameraCalibration     /<camera>/detections   foxglove.ImageAnnotations
+/tf  /scene               foxglove.FrameTransforms, SceneUpdate
+/joint_states  /joint_commands   foxglove.JointStates of the station's measured and commanded vectors
+/<side>_wrist/wrench      schemas.Wrench, as the sensor gives it
+/events  /log             foxglove.Event, foxglove.Log
+/health  /operator/command   the station's and the operator's messages
+/truth/...                schemas.Vector: simulation only; left out when the ports are not connected
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -44,7 +43,8 @@ from valve_drake.messages import (
 from valve_drake.ports import TICK
 from valve_drake.recording import foxglove
 from valve_drake.recording.recorder_system import ONCE, Signal
-from valve_drake.recording.schemas import Vector, Wrench
+from valve_drake.recording.refilled import STAMP, Refilled, slot
+from valve_drake.recording.schemas import Encoded, Vector, Wrench, proto_class, serialized
 
 SLOW = 1 / 32  # period of what is large, or only to be looked at [s]
 BEHAVIORS = ("valve_search", "base_approach", "kinematic_approach", "image_servo", "hybrid_rotation")
@@ -118,6 +118,8 @@ for _side in SIDES:
         f"{_side}_gripper.force_limit": (f"{_side}_gripper.effort",),
     }
 
+JOINED = {"measured": MEASURED, "commanded": COMMANDED}  # the recorder reads these vectors as one: it costs less
+
 
 def signals(
     frames: Callable[..., Iterable[tuple[str, str, np.ndarray]]],
@@ -132,14 +134,15 @@ def signals(
     """
     rows = [output(block, port, kind) for block, port, kind in OUTPUTS]
     rows += [output("robot_state", "robot_state", RobotState, SLOW)]
-    rows += [joints("/joint_states", MEASURED), joints("/joint_commands", COMMANDED)]
+    rows += [joints("/joint_states", "measured"), joints("/joint_commands", "commanded")]
     rows += [wrench(side) for side in SIDES]
     rows += [Signal("/health", {"health": Health}, as_it_is)]
     rows += [row for side in SIDES for row in (*head_camera(side), *wrist_camera(side))]
     rows += [calibration(camera, size, K) for camera, (size, K) in (calibrations or {}).items()]
     rows += [transforms(BELIEF, frames), marker_pose()]
     if scene is not None:
-        rows += [Signal("/scene", {}, lambda time: scene, period=ONCE)]
+        looks = serialized(scene)  # here, for it takes several ms
+        rows += [Signal("/scene", {}, lambda time: looks, period=ONCE)]
     rows += [*mode_events(), health_line(), *(status_line(block) for block in BEHAVIORS)]
     rows += [vector(topic_of(port), port, names, SLOW) for port, names in TRUTH.items()]
     return rows
@@ -165,40 +168,37 @@ def output(block: str, port: str, kind: type[Message], period: float = TICK) -> 
 
 def vector(topic: str, port: str, names: Sequence[str], period: float = TICK) -> Signal:
     """A vector port with a name for each value."""
-    names = tuple(names)
-    return Signal(topic, {port: len(names)}, lambda time, values: Vector(time, names, values), period)
+    count = len(names)
+    form = proto_class(Vector)(time=slot(0), names=names, values=[slot(k + 1) for k in range(count)])
+    return Signal(topic, {port: count}, numbers(Refilled(form, count + 1)), period)
 
 
 def wrench(side: str) -> Signal:
     """A wrist's [torque; force]."""
-    return Signal(
-        f"/{side}_wrist/wrench", {f"{side}_wrist.wrench": 6}, lambda time, F: Wrench(time, torque=F[:3], force=F[3:])
-    )
+    t, *F = (slot(k) for k in range(7))
+    form = proto_class(Wrench)(time=t, torque=F[:3], force=F[3:])
+    return Signal(f"/{side}_wrist/wrench", {f"{side}_wrist.wrench": 6}, numbers(Refilled(form, 7)))
 
 
-def joints(topic: str, ports: Mapping[str, Sequence[str]]) -> Signal:
-    """Vector ports as one JointStates. ports: port -> "<joint>.<quantity>" for each of its values.
+def numbers(form: Refilled) -> Callable[..., Encoded]:
+    """An encoder that fills the time and the values of a vector port into a form."""
+    return lambda time, values: form.fill(foxglove.nanoseconds(time), [time, *values.tolist()])
 
-    The quantities are position, velocity and effort.
-    """
-    states, by_name = JointStates(), {}
-    places = []  # for each port, for each value: joint, quantity
-    for values in ports.values():
-        places.append([])
-        for value in values:
-            joint, quantity = value.split(".")
-            if joint not in by_name:
-                by_name[joint] = states.joints.add(name=joint)
-            places[-1].append((by_name[joint], quantity))
 
-    def encode(time: float, *arrays: np.ndarray) -> JointStates:
-        states.timestamp.CopyFrom(foxglove.stamp(time))
-        for targets, values in zip(places, arrays, strict=True):
-            for (joint, quantity), value in zip(targets, values.tolist(), strict=True):
-                setattr(joint, quantity, value)
-        return states
+def joints(topic: str, port: str) -> Signal:
+    """A port that joins others (JOINED) as JointStates; the quantities are position, velocity and effort."""
+    states, by_name = JointStates(timestamp=STAMP), {}
+    values = [value.split(".") for names in JOINED[port].values() for value in names]
+    for k, (joint, quantity) in enumerate(values):
+        if joint not in by_name:
+            by_name[joint] = states.joints.add(name=joint)
+        setattr(by_name[joint], quantity, slot(k))
+    form = Refilled(states, len(values))
 
-    return Signal(topic, {port: len(values) for port, values in ports.items()}, encode)
+    def encode(time: float, numbers: np.ndarray) -> Encoded:
+        return form.fill(foxglove.nanoseconds(time), numbers.tolist())
+
+    return Signal(topic, {port: len(values)}, encode)
 
 
 def image(camera: str) -> Signal:
@@ -238,10 +238,9 @@ def calibration(camera: str, size: tuple[int, int], K: np.ndarray) -> Signal:
 
 def transforms(inputs: Mapping[str, type[Message]], frames: Callable[..., Iterable], period: float = SLOW) -> Signal:
     """Frames computed from messages, valid at the first message's time."""
-    transforms = FrameTransforms()
 
-    def encode(time: float, *messages: Any) -> FrameTransforms:
-        return foxglove.transforms(messages[0].time, frames(*messages), transforms)
+    def encode(time: float, *messages: Any) -> Encoded:
+        return foxglove.transforms(messages[0].time, frames(*messages))
 
     return Signal("/tf", inputs, encode, period)
 

@@ -1,6 +1,6 @@
 """The log's writer: MCAP with protobuf, safe against crashes, and never in the way of the loop.
 
-`write` serialises a message and adds it to a chunk in memory. A thread compresses whole chunks and brings them to
+`write` adds a serialised message to a chunk in memory. A thread compresses whole chunks and brings them to
 the disk, so that no tick waits for it. The file's bytes depend on the messages alone: chunks are closed by size, by the
 messages' own time and by `flush`, never by the clock on the wall, and nothing of the machine or the day is written.
 
@@ -25,7 +25,6 @@ from typing import Any, Self
 from google.protobuf.message import Message as Proto
 from mcap.records import Attachment, Channel, Schema
 
-from valve_drake.messages import Message
 from valve_drake.recording import schemas
 from valve_drake.recording.container import CHUNK_SIZE, Chunk, McapFile, active, open_active, publish
 from valve_drake.recording.foxglove import NANO, nanoseconds
@@ -61,7 +60,7 @@ class LogWriter:
         """Why logging has stopped; "" while all is well."""
         return self._error
 
-    def write(self, topic: str, message: Message | Proto, time: float) -> None:
+    def write(self, topic: str, message: schemas.Loggable, time: float) -> None:
         """Appends a message of `topic` at `time` [s]. Times must not decrease; a topic keeps one type of message."""
         if self._error:
             self._tell()
@@ -72,10 +71,11 @@ class LogWriter:
             self.flush()
         elif self._chunk.size > CHUNK_SIZE:
             self._close_chunk()
-        channel = self._channels.get(topic) or self._define(topic, type(message))
-        if type(message) is not channel.kind:
-            raise TypeError(f"{topic} holds {channel.kind.__name__}, got {type(message).__name__}")
-        self._chunk.add(channel.id, when, channel.count, channel.encode(message))
+        kind, data = schemas.serialized(message)
+        channel = self._channels.get(topic) or self._define(topic, kind)
+        if kind is not channel.kind:
+            raise TypeError(f"{topic} holds {channel.kind.__name__}, got {kind.__name__}")
+        self._chunk.add(channel.id, when, channel.count, data)
         channel.count += 1
 
     def write_metadata(self, name: str, facts: Mapping[str, str]) -> None:
@@ -120,21 +120,17 @@ class LogWriter:
             if error is None:  # else the run's own error is the one to show
                 raise
 
-    def _define(self, topic: str, kind: type) -> "_Channel":
+    def _define(self, topic: str, kind: type[Proto]) -> "_Channel":
         """A new topic's channel, and its schema unless another topic has brought it."""
-        proto = schemas.proto_class(kind) if issubclass(kind, Message) else kind
-        name = proto.DESCRIPTOR.full_name
+        name = kind.DESCRIPTOR.full_name
         if name not in self._schemas:
             self._schemas[name] = len(self._schemas) + 1
-            data = schemas.schema_data(proto)
+            data = schemas.schema_data(kind)
             self._chunk.define(Schema(id=self._schemas[name], name=name, encoding="protobuf", data=data))
-        encode = schemas.encode if issubclass(kind, Message) else kind.SerializeToString
-        channel = _Channel(len(self._channels) + 1, kind, encode)
+        channel = _Channel(len(self._channels) + 1, kind)
         self._channels[topic] = channel
         self._chunk.define(
-            Channel(
-                id=channel.id, topic=topic, message_encoding="protobuf", metadata={}, schema_id=self._schemas[name]
-            )
+            Channel(id=channel.id, topic=topic, message_encoding="protobuf", metadata={}, schema_id=self._schemas[name])
         )
         return channel
 
@@ -179,6 +175,5 @@ class LogWriter:
 @dataclasses.dataclass
 class _Channel:
     id: int
-    kind: type
-    encode: Callable[[Any], bytes]
+    kind: type[Proto]
     count: int = 0

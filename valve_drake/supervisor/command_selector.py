@@ -2,8 +2,9 @@
 
 SOURCE says who commands which group in which mode. A group without an owner holds: the base brakes to zero twist,
 joints brake and stay. So does a group whose command is missing, older than `max_age`, not finite or otherwise wrong,
-and every group while the robot's state or the mode is that old. An emergency stop holds everything but the grippers,
-so that a hand can always be opened. In failed and stopped the hands open, whatever happened before.
+every group while the robot's state or the mode is that old, and a group whose device has reported nothing for that
+long (both arms if one of them is silent, or the other would pull at what both hold). An emergency stop holds everything
+but the grippers, so that a hand can always be opened. In failed and stopped the hands open, whatever happened before.
 
 Position, speed and acceleration are bounded by motion.follow: within the bounds a command passes unchanged.
 The first command of each joint is its measured position.
@@ -31,6 +32,8 @@ JOINTS = {
 }
 GROUPS = ("base", *JOINTS)
 GRIPPERS = ("left_gripper", "right_gripper")
+ARMS = ("left_arm", "right_arm")
+FOLLOWERS = ("base", "torso", *ARMS)  # that are where they are commanded; fingers stop at what they hold
 
 PORTS = {
     "base.twist_command": 2,
@@ -85,9 +88,12 @@ class CommandSelectorConfig:
     gripper_speed: float = 0.1  # [m/s]
     gripper_acceleration: float = 2.0  # [m/s^2]
     gripper_force: float = 80.0  # [N]
-    max_age: float = 0.1  # of a command, of the robot's state and of the mode, before the robot holds [s]
+    max_age: float = 0.1  # of a command, a device's report, the robot's state and the mode, before the robot holds [s]
     trip_force: float = 90.0  # raw force at a wrist sensor, gravity included, that trips [N]
     trip_ticks: int = 3  # ticks in a row above it
+    follow_error: float = 0.15  # of arms and torso behind their command [rad]
+    follow_speed: float = 0.25  # of the base off its command [m/s, rad/s]
+    follow_time: float = 0.25  # for so long: the group does not follow [s]
 
     def check(self) -> None:
         block = "command_selector"
@@ -147,6 +153,7 @@ class Memory:
     activation: int = -1
     over: tuple[int, int] = (0, 0)  # ticks in a row with a force above the trip
     tripped: tuple[str, ...] = ()
+    behind: tuple[int, ...] = (0,) * len(FOLLOWERS)  # ticks in a row behind the command
 
 
 def start(config: CommandSelectorConfig, initial: Mapping[str, np.ndarray]) -> Memory:
@@ -213,6 +220,7 @@ def step(
     position, velocity, target, joints_changed = _joints(m, wanted, dt)
     force, force_changed = _force(config, m, wanted)
     over, tripped = _trip(config, m, mode, robot_state)
+    behind, astray = _follow(config, m, robot_state, dt)
     memory = dc.replace(
         m,
         position=position,
@@ -223,6 +231,7 @@ def step(
         activation=mode.activation,
         over=over,
         tripped=tripped,
+        behind=behind,
     )
     report = SelectorReport(
         time=time,
@@ -230,6 +239,7 @@ def step(
         limited=(*changed, *joints_changed, *force_changed),
         refused=tuple(refused),
         tripped=tripped,
+        astray=astray,
     )
     return memory, report
 
@@ -255,7 +265,14 @@ def _sources(
         return dict.fromkeys(GROUPS, HOLD), late
     if health.estop:
         return {g: s if g in GRIPPERS else HOLD for g, s in source.items()}, ["emergency stop"]
-    return source, []
+    silent = {device: age for device, age in zip(health.devices, health.ages) if not age <= config.max_age}
+    problems = []
+    for group in source:
+        for device in ARMS if group in ARMS else (group,):
+            if device in silent:
+                source[group] = HOLD
+                problems.append(f"{group}: {device} silent for {silent[device]:.2f} s")
+    return source, problems
 
 
 def _asked(
@@ -341,3 +358,14 @@ def _trip(
         over.append(0 if safe else count + 1)
     now = [side for side, count in zip(SIDES, over) if count >= config.trip_ticks]
     return (over[0], over[1]), tuple(side for side in (LEFT, RIGHT) if side in kept or side in now)
+
+
+def _follow(
+    config: CommandSelectorConfig, m: Memory, state: RobotState, dt: float
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Counts ticks for which each group is behind its last command; written so that NaN is behind."""
+    off = np.abs(measured(state) - m.position)
+    near = {group: np.all(off[JOINTS[group]] <= config.follow_error) for group in FOLLOWERS if group != "base"}
+    near["base"] = np.all(np.abs(state.odometry[3:] - m.twist) <= config.follow_speed)
+    behind = tuple(0 if near[group] else count + 1 for group, count in zip(FOLLOWERS, m.behind))
+    return behind, tuple(group for group, count in zip(FOLLOWERS, behind) if count * dt > config.follow_time)

@@ -88,7 +88,7 @@ class SupervisorConfig:
         default_factory=lambda: {"marker_lost": 2, "measure": 2, "servo": 2, "grasp": 2}
     )  # in a run, by what failed
     max_age: dict[str, float] = dc.field(
-        default_factory=lambda: {"head_left": 1.0, "head_right": 1.0}
+        default_factory=lambda: {"head_left": 1.0, "head_right": 1.0, "left_wrist": 1.0, "right_wrist": 1.0}
     )  # a device that is silent for longer is a fault [s]
     other_age: float = 0.25  # the same for all devices not named in max_age [s]
     report_age: float = 0.25  # the same for the health and selector reports themselves [s]
@@ -198,7 +198,9 @@ def find_fault(
         if not time - selector.time <= config.report_age:
             return "no report from command_selector"
         if selector.tripped:
-            return "force above the trip: " + ", ".join(f"{side} hand" for side in selector.tripped)
+            return "force above the trip or not known: " + ", ".join(f"{side} hand" for side in selector.tripped)
+        if selector.astray:
+            return ", ".join(selector.astray) + " does not follow the command"
     return ""
 
 

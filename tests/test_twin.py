@@ -1,0 +1,315 @@
+"""twin: the robot at the other end of the wire, its guard, its faults, and whole runs against it."""
+
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from valve_drake import rehearsal, runner
+from valve_drake import scenario as scenarios
+from valve_drake.checks import ConfigError
+from valve_drake.messages import Mode
+from valve_drake.pace import Pacer
+from valve_drake.ports import TICK
+from valve_drake.recording.reader import LogReader
+from valve_drake.stations.contract import CONTRACT
+from valve_drake.stations.faults import FaultConfig, Faults, Wire
+from valve_drake.stations.lcm_channels import COMMANDS, REPORTS
+from valve_drake.stations.twin import Guard
+
+ARM = "left_arm.position_command"
+SIZES = {spec.name: spec.kind for spec in CONTRACT if isinstance(spec.kind, int)}
+START = {port: np.full(size, 0.02) for port, size in SIZES.items() if "command" in port or "limit" in port}
+MEASURED = {port: np.full(size, 0.01) for port, size in SIZES.items() if "measured" in port}
+LATE = [{"kind": "latency", "delay": 0.02, "jitter": 0.01}, {"kind": "loss", "share": 0.01}]
+
+
+def ask(guard, time, **changes):
+    """A full set of commands; `changes` by port with _ for the dot."""
+    said = START | {port.replace("__", "."): np.asarray(value, float) for port, value in changes.items()}
+    for row in COMMANDS:
+        guard.take(row.key, {port: said[port] for port in row.read(row.encode(0, said))}, MEASURED, time)
+
+
+# ---------------------------------------------------------------- the guard
+
+
+def test_fresh_commands_pass():
+    guard = Guard(START, 0.1)
+    ask(guard, 1.0, base__twist_command=[0.3, 0.1])
+    targets = guard.targets(MEASURED, False, 1.09)
+    assert targets.keys() == START.keys() and not guard.faults(1.09)
+    np.testing.assert_array_equal(targets["base.twist_command"], [0.3, 0.1])
+    np.testing.assert_array_equal(targets[ARM], START[ARM])
+
+
+def test_commands_older_than_100_ms_stop_the_joints_where_they_are_and_the_base():
+    guard = Guard(START, 0.1)
+    ask(guard, 1.0, base__twist_command=[0.3, 0.1])
+    targets = guard.targets(MEASURED, False, 1.0 + 0.1 + 1e-9)
+    np.testing.assert_array_equal(targets["base.twist_command"], 0)
+    np.testing.assert_array_equal(targets[ARM], MEASURED["left_arm.position_measured"])
+    np.testing.assert_array_equal(targets["left_gripper.force_limit"], START["left_gripper.force_limit"])
+    assert "left_arm.command late" in guard.faults(1.2)
+    moved = {port: value + 0.1 for port, value in MEASURED.items()}
+    assert guard.targets(moved, False, 1.3)[ARM][0] == 0.01, "held where it stopped, not where it sags to"
+
+
+def test_a_joint_that_was_stopped_goes_slowly_to_its_new_commands():
+    guard = Guard(START, 0.1)
+    ask(guard, 1.0)
+    guard.targets(MEASURED, False, 1.2)
+    path = []
+    for k in range(60):
+        ask(guard, 1.4 + k * TICK, left_arm__position_command=[0.11] * 6)
+        path.append(guard.targets(MEASURED, False, 1.4 + k * TICK)[ARM][0])
+    steps = np.diff([0.01, *path])
+    assert np.all(steps >= 0) and steps.max() <= 0.3 * TICK + 1e-12 and path[-1] == 0.11
+
+
+def test_before_the_first_command_nothing_is_late():
+    guard = Guard(START, 0.1)
+    np.testing.assert_array_equal(guard.targets(MEASURED, False, 50.0)[ARM], START[ARM])
+    assert not guard.faults(50.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"left_arm__position_command": [math.nan] * 6}, "left_arm.command refused: not finite"),
+        ({"left_arm__position_command": [0.9] + [0.0] * 5}, "left_arm.command refused: 0.89 rad off"),
+        ({"torso__position_command": [0, math.inf, 0]}, "torso.command refused: not finite"),
+        ({"base__twist_command": [9.0, 0.0]}, "base.command refused: too fast"),
+        ({"left_gripper__position_command": [3.0]}, "left_gripper.command refused: out of range"),
+        ({"left_gripper__force_limit": [-1.0]}, "left_gripper.command refused: out of range"),
+    ],
+)
+def test_a_broken_or_absurd_command_is_refused_and_reported(change, words):
+    guard = Guard(START, 0.1)
+    ask(guard, 1.0)
+    ask(guard, 1.05, **change)
+    port = next(iter(change)).replace("__", ".")
+    np.testing.assert_array_equal(guard.targets(MEASURED, False, 1.05)[port], START[port])
+    assert any(fault.startswith(words) for fault in guard.faults(1.05))
+
+
+def test_an_emergency_stop_leaves_the_fingers_to_their_commands():
+    guard = Guard(START, 0.1)
+    ask(guard, 1.0, base__twist_command=[0.3, 0.1])
+    assert guard.targets(MEASURED, True, 1.0)[ARM][0] == 0.01
+    ask(guard, 1.01, left_gripper__position_command=[0.07])
+    moved = {port: value + 0.1 for port, value in MEASURED.items()}
+    targets = guard.targets(moved, True, 1.01)
+    assert targets[ARM][0] == 0.01 and targets["left_gripper.position_command"][0] == 0.07
+    np.testing.assert_array_equal(targets["base.twist_command"], 0)
+
+
+# ---------------------------------------------------------------- faults
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ("{kind: gremlin}", ["faults.kind", "gremlin"]),
+        ("{kind: nan, device: nose}", ["faults.device", "nose"]),
+        ("{kind: nan, mode: dance}", ["faults.mode", "dance"]),
+        ("{kind: loss, share: 2}", ["faults.share", "2"]),
+        ("{kind: latency, delay: 0.01, jitter: 0.02}", ["faults.jitter"]),
+        ("{kind: restart, device: base}", ["faults.duration"]),
+        ("{kind: stuck, device: base}", ["faults.device", "torso"]),
+        ("{kind: stuck, device: torso, joint: 3}", ["faults.joint", "0..2"]),
+    ],
+)
+def test_bad_faults_give_one_line(entry, words):
+    with pytest.raises(ConfigError) as caught:
+        scenarios.load("hardware.scenario.yaml", [f"faults=[{entry}]"])
+    assert all(word in str(caught.value) for word in words) and "\n" not in str(caught.value)
+
+
+def test_a_fault_begins_with_its_mode_and_lasts_for_its_duration():
+    faults = Faults([FaultConfig("nan", "left_arm", "turn", start=1.0, duration=2.0)], seed=1)
+    assert not faults.acts("nan", "left_arm", 50.0)
+    faults.enter("turn", 60.0)
+    faults.enter("turn", 62.5)  # again: it is the first entry that counts
+    acting = [time for time in (60.9, 61.0, 62.9, 63.0) if faults.acts("nan", "left_arm", time)]
+    assert acting == [61.0, 62.9] and not faults.acts("nan", "right_arm", 61.0)
+
+
+def test_a_restarted_device_is_silent_and_then_its_clock_begins_anew():
+    faults = Faults([FaultConfig("restart", "torso", start=5.0, duration=1.0)], seed=1)
+    assert faults.silent("torso", 5.5) and not faults.silent("torso", 6.0) and not faults.silent("base", 5.5)
+    assert faults.clock("torso", 5.5) == 5.5 and faults.clock("torso", 6.25) == 0.25
+    assert faults.clock("base", 6.25) == 6.25
+
+
+def deliver(faults, ticks=400, newest_only=False):
+    got = []
+    wire = Wire(faults, lambda key, message: got.append((round(now / TICK), message)), newest_only)
+    for k in range(ticks + 20):
+        now = k * TICK
+        if k < ticks:
+            wire.put("torso.status", k, now)
+        wire.pass_on(now)
+    return got
+
+
+def test_a_whole_wire_delivers_everything_at_once_and_in_order():
+    assert deliver(Faults([], 1)) == [(k, k) for k in range(400)]
+
+
+def test_latency_is_within_its_bounds_and_overtakes():
+    got = deliver(Faults([FaultConfig("latency", delay=0.02, jitter=0.01)], 1))
+    late = np.array([when - sent for when, sent in got])
+    assert len(got) == 400 and late.min() == 2 and late.max() == 4
+    assert any(b[1] < a[1] for a, b in zip(got, got[1:]))
+
+
+def test_loss_duplicates_and_reordering_have_their_share():
+    assert 300 < len(deliver(Faults([FaultConfig("loss", share=0.1)], 1))) < 390
+    assert 410 < len(deliver(Faults([FaultConfig("duplicate", share=0.1)], 1))) < 490
+    order = [sent for _, sent in deliver(Faults([FaultConfig("reorder", share=0.1)], 1))]
+    assert sorted(order) == list(range(400)) and order != sorted(order)
+
+
+def test_chance_is_the_seeds():
+    def lost(seed):
+        return deliver(Faults([FaultConfig("loss", share=0.1)], seed))
+
+    assert lost(1) == lost(1) != lost(2)
+
+
+def test_a_wire_into_a_receiver_with_room_for_one_brings_the_newest():
+    got = deliver(Faults([FaultConfig("duplicate", share=1.0)], 1), newest_only=True)
+    assert got == [(k, k) for k in range(400)]
+
+
+# ---------------------------------------------------------------- pace
+
+
+def test_a_pacer_keeps_its_period_counts_what_is_late_and_makes_nothing_up(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("valve_drake.pace.wall.monotonic", lambda: clock[0])
+    pacer = Pacer(0.01, idle=lambda left: clock.__setitem__(0, clock[0] + left))
+    begun = []
+
+    def work(took):
+        begun.append(clock[0])
+        clock[0] += took
+
+    for took in (0.002, 0.003, 0.025, 0.001, 0.001):
+        pacer.tick(lambda took=took: work(took))
+    np.testing.assert_allclose(begun, [0, 0.01, 0.02, 0.045, 0.055])
+    pace = pacer.report(7.0)
+    assert (pace.ticks, pace.missed, pace.time) == (5, 1, 7.0)
+    assert pace.lost == pytest.approx(0.015) and pace.longest == pytest.approx(0.025)
+    assert pace.median == pytest.approx(0.002)
+
+
+# ---------------------------------------------------------------- the whole, in one process
+
+
+def near(*overrides):
+    """A start from which the valve is soon reached."""
+    quick = ["simulation.start.distance=2.6", "simulation.start.bearing=0.1", "simulation.start.heading=0.1"]
+    return scenarios.load("hardware.scenario.yaml", ["seed=1", "hardware.lockstep=true", *quick, *overrides])
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """One second of the program against its twin, without any network."""
+    path = tmp_path_factory.mktemp("twin") / "short.mcap"
+    scenario = near()
+    with rehearsal.beside(scenario) as (link, twin):
+        result = runner.run(scenario, path, link=link, duration=1.0)
+        return result, path, twin
+
+
+def test_the_program_drives_the_twin_through_lcm(short):
+    result, path, twin = short
+    assert result.summary.spans[1].mode == Mode.SEARCH and twin.tick == 128
+    log = LogReader(path)
+    assert log.damage == [] and log.topics["/head_left/image"].count > 0
+    last = [m for _, _, m in log.messages(["/joint_states"])][-1]
+    neck = {joint.name: joint.position for joint in last.joints}
+    assert abs(neck["neck_yaw"]) > 0.01 or abs(neck["neck_pitch"]) > 0.01, "the gaze has moved"
+
+
+def test_in_lock_step_all_devices_are_fresh_and_nothing_is_refused(short):
+    log = LogReader(short[1])
+    health = [log.decode(record) for record in log.records(["/health"])]
+    assert len(health) > 30
+    assert not any(h.faults or h.estop for h in health)
+    assert max(np.max(h.ages[: len(REPORTS)]) for h in health) == 0
+
+
+def test_the_same_seed_gives_the_same_log_to_the_byte(short, tmp_path):
+    _, path, _ = short
+    scenario = near()
+    with rehearsal.beside(scenario) as (link, _):
+        runner.run(scenario, tmp_path / "again.mcap", link=link, duration=1.0)
+    assert (tmp_path / "again.mcap").read_bytes() == path.read_bytes()
+
+
+def test_a_hardware_log_replays_to_the_bit(short):
+    result = runner.replay(LogReader(short[1]))
+    assert result.comparison.identical, result.comparison.first
+
+
+# ---------------------------------------------------------------- two processes
+
+SPACE = ["unshare", "-rn", "sh", "-c", 'ip link set lo up && ip route add 224.0.0.0/4 dev lo && exec "$@"', "sh"]
+
+
+def _space() -> str:
+    """Why there is no network namespace, or ""."""
+    if not all(map(shutil.which, ("unshare", "ip"))):
+        return "no unshare or ip on this machine"
+    tried = subprocess.run([*SPACE, "true"], capture_output=True, text=True)
+    return "" if tried.returncode == 0 else f"no network namespace here: {tried.stderr.strip()}"
+
+
+def two_processes(folder, run, twin, common=()):
+    """Both commands in a network namespace of their own, so that nothing leaves the machine -> (run, twin) JSON."""
+    (folder / "both.sh").write_text(
+        'python=$1; "$python" -m valve_drake twin $TWIN $COMMON --json > twin.json & '
+        '"$python" -m valve_drake run hardware.scenario.yaml $RUN $COMMON --log run.mcap --json > run.json; '
+        "code=$?; wait $!; exit $code\n"
+    )
+    words = {"RUN": " ".join(run), "TWIN": " ".join(twin), "COMMON": " ".join(common)}
+    done = subprocess.run(
+        [*SPACE, "sh", "both.sh", sys.executable], cwd=folder, env=os.environ | words, capture_output=True, text=True
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return done, [json.loads((folder / f"{name}.json").read_text()) for name in ("run", "twin")]
+
+
+needs_space = pytest.mark.skipif(bool(_space()), reason=_space() or "-")
+
+
+@needs_space
+@pytest.mark.slow
+@pytest.mark.parametrize("faults", [[], LATE], ids=["good wire", "20 ms late, 1 % lost"])
+def test_the_whole_job_by_two_processes(tmp_path, faults):
+    common = ["--lockstep", "--seed", "1", "--set", "hardware.answer_time=30"]
+    twin = ["--set", f"faults={json.dumps(faults, separators=(',', ':'))}"] if faults else []
+    done, (run, twin) = two_processes(tmp_path, [], twin, common)
+    assert done.returncode == 0 and run["verdict"] == "turned"
+    assert twin["valve_angle_true_rad"] == pytest.approx(run["valve_angle_estimated_rad"], abs=0.01)
+    assert twin["valve_angle_true_rad"] == pytest.approx(math.pi / 2, abs=0.035)
+
+
+@needs_space
+@pytest.mark.slow
+def test_real_time_is_kept_and_its_keeping_is_logged(tmp_path):
+    common = ["--seed", "1", "--set", "hardware.answer_time=30"]
+    _, (run, twin) = two_processes(tmp_path, ["--duration", "5"], [], common)
+    assert run["sim_time_s"] == pytest.approx(5.0, abs=0.1)
+    pace = run["pace"]
+    assert pace["ticks"] == pytest.approx(640, abs=10) and pace["missed"] < 0.1 * pace["ticks"]
+    logged = list(LogReader(tmp_path / "run.mcap").messages(["/pace"]))
+    assert len(logged) >= 4 and twin["ticks"] > 640

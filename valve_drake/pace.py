@@ -1,0 +1,81 @@
+"""Real time: a loop that is held to the wall's clock, and how well it kept it.
+
+A tick that is late is not made up for: the next one begins a full period after it did, so that commands never come in
+bursts. What was late is counted.
+"""
+
+import dataclasses as dc
+import math
+import time as wall
+from collections.abc import Callable
+
+import numpy as np
+
+from valve_drake.messages import Message
+from valve_drake.ports import TICK
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Pace(Message):
+    """How a paced loop has kept its time since its beginning; logged as /pace every second.
+
+    A tick's time: from reading the station to its last command's being published.
+    """
+
+    time: float = 0.0  # [s]
+    ticks: int = 0
+    missed: int = 0  # ticks that ended after the next one should have begun
+    lost: float = 0.0  # by how much wall time has run ahead [s]
+    median: float = 0.0  # of a tick's time [s]
+    p99: float = 0.0
+    longest: float = 0.0
+
+    def as_json(self) -> dict:
+        """What `run --json` says of it."""
+        times = {f"{name}_ms": 1e3 * getattr(self, name) for name in ("median", "p99", "longest")}
+        return {"ticks": self.ticks, "missed": self.missed, "lost_s": self.lost, **times}
+
+
+class Pacer:
+    """Holds ticks of `period` seconds to the wall's clock. idle(seconds): passes some of the time until the next."""
+
+    def __init__(self, period: float = TICK, idle: Callable[[float], None] = wall.sleep):
+        self._period = period
+        self._idle = idle
+        self.due = math.nan  # when the present tick began, or the next one will [s, wall]
+        self._times: list[float] = []
+        self._missed = 0
+        self._lost = 0.0
+
+    def tick(self, work: Callable[[], None]) -> None:
+        """Waits until a tick is due, then does its work."""
+        if math.isnan(self.due):
+            self.due = wall.monotonic()
+        self.wait(self.due)
+        begin = wall.monotonic()
+        work()
+        end = wall.monotonic()
+        self._times.append(end - begin)
+        self.due += self._period
+        if end > self.due:
+            self._missed += 1
+            self._lost += end - self.due
+            self.due = end
+
+    def wait(self, until: float) -> None:
+        """Until the wall's clock says so."""
+        while (left := until - wall.monotonic()) > 0:
+            self._idle(left)
+
+    def report(self, time: float) -> Pace:
+        """How it went so far. time: of the loop's own clock [s]."""
+        times = np.array(self._times or [0.0])
+        return Pace(
+            time=time,
+            ticks=len(self._times),
+            missed=self._missed,
+            lost=self._lost,
+            median=float(np.median(times)),
+            p99=float(np.quantile(times, 0.99)),
+            longest=float(times.max()),
+        )

@@ -1,0 +1,104 @@
+"""Rehearsing a hardware run: the twin of a scenario, as a process of its own or beside the program in one."""
+
+import contextlib
+import dataclasses as dc
+import gc
+from collections.abc import Callable, Iterator
+
+import cv2
+from pydrake.lcm import DrakeLcm
+
+from valve_drake.diagram import initial_commands, make_station
+from valve_drake.pace import Pace, Pacer
+from valve_drake.ports import SLOT
+from valve_drake.scenario import Scenario, resolve
+from valve_drake.stations.camera_workers import CameraWorkers
+from valve_drake.stations.faults import Faults
+from valve_drake.stations.hardware import RobotLink
+from valve_drake.stations.lcm_channels import Bus
+from valve_drake.stations.twin import LiveImages, Twin
+
+
+@dc.dataclass(frozen=True)
+class Rehearsed:
+    """What became of the twin."""
+
+    time: float  # that passed in it [s]
+    valve_start: float  # opened since closed [rad]
+    valve_end: float
+    pace: Pace | None
+
+    def as_json(self) -> dict:
+        """The object of `twin --json`."""
+        return {
+            "sim_time_s": self.time,
+            "valve_angle_true_rad": self.valve_end - self.valve_start,
+            "valve_start_rad": self.valve_start,
+            "valve_end_rad": self.valve_end,
+            "missed_ticks": self.pace and self.pace.missed,
+            "ticks": self.pace and self.pace.ticks,
+        }
+
+
+def make_twin(scenario: Scenario, *, workers: CameraWorkers | None = None, lcm: DrakeLcm | None = None) -> Twin:
+    """The twin of a resolved scenario. workers: make its images; LiveImages are needed to keep real time."""
+    station = make_station(dc.replace(scenario, station="simulated"), workers=workers)
+    return Twin(
+        station,
+        initial_commands(scenario),
+        scenario.hardware,
+        scenario.simulation.camera,
+        Faults(scenario.faults, scenario.seed),
+        images=workers if isinstance(workers, LiveImages) else None,
+        lcm=lcm,
+    )
+
+
+@contextlib.contextmanager
+def beside(scenario: Scenario) -> Iterator[tuple[RobotLink, Twin]]:
+    """A twin and the link to it in one process, in lock-step, without any network."""
+    scenario = resolve(scenario)
+    lcm = DrakeLcm("memq://")
+    hardware = dc.replace(scenario.hardware, lockstep=True)
+    with CameraWorkers() as workers:
+        twin = make_twin(dc.replace(scenario, hardware=hardware), workers=workers, lcm=lcm)
+        yield RobotLink(Bus(hardware, lcm), idle=twin.poll), twin
+
+
+def run_twin(
+    scenario: Scenario,
+    *,
+    duration: float | None = None,
+    show: Callable[[float], None] = lambda time: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Rehearsed:
+    """Runs the twin of a scenario until the program at the other end has gone, or for `duration` [s] of its time.
+
+    show: called with its time, every tick. stop: True ends it.
+    """
+    scenario = resolve(scenario)
+    scenario.check()
+    cv2.setNumThreads(1)
+    lockstep = scenario.hardware.lockstep
+    with CameraWorkers() if lockstep else LiveImages() as workers:
+        twin = make_twin(scenario, workers=workers)
+        begin = float(twin.read("truth.valve_angle")[0])
+        pacer = None if lockstep else Pacer(idle=twin.pass_time)
+        gc.collect()
+        gc.freeze()
+        while not (stop() or twin.gone or (duration is not None and twin.time >= duration)):
+            show(twin.time)
+            if pacer is None:
+                twin.wait()
+            else:
+                pacer.tick(lambda: _tick(twin, pacer))
+        end = float(twin.read("truth.valve_angle")[0])
+        return Rehearsed(twin.time, begin, end, pacer and pacer.report(twin.time))
+
+
+def _tick(twin: Twin, pacer: Pacer) -> None:
+    """Reports, gives the program until slot 3 to answer, moves."""
+    twin.report()
+    pacer.wait(pacer.due + 3 * SLOT)
+    twin.hear()
+    twin.move()

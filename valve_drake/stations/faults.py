@@ -1,0 +1,155 @@
+"""Faults of a robot and of the wire to it, for rehearsals: the twin has those that the scenario's key `faults` lists.
+
+| kind      | what it does to `device` ("" is every device)                                            | numbers       |
+|-----------|------------------------------------------------------------------------------------------|---------------|
+| latency   | its messages, commands and reports, take `delay` longer, give or take `jitter`           | delay, jitter |
+| loss      | this share of its messages is lost                                                       | share         |
+| duplicate | this share of its messages comes twice                                                   | share         |
+| reorder   | this share of its messages is overtaken by the next one                                  | share         |
+| frozen    | its reports and images go on saying what they said                                       |               |
+| nan       | its reports are not numbers                                                              |               |
+| dead      | it reports nothing, takes no commands: a camera without images, a driver that crashed    |               |
+| restart   | as dead, and then its clock begins anew; needs a `duration`                              | duration      |
+| stuck     | one joint of an arm or of the torso does not move                                        | joint         |
+| estop     | the emergency stop of the whole robot is pressed                                         |               |
+
+A fault begins `start` seconds after the run's beginning, or after `mode` was first entered, and lasts `duration`
+(0: to the end). What chance decides is drawn from the seed.
+"""
+
+import collections
+import dataclasses as dc
+import math
+import zlib
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from valve_drake.checks import require, require_in
+from valve_drake.messages import Mode
+from valve_drake.ports import TICK
+from valve_drake.stations.contract import CAMERAS
+from valve_drake.stations.lcm_channels import CHANNELS, REPORTS
+
+WIRE = ("latency", "loss", "duplicate", "reorder")
+DEVICE = ("frozen", "nan", "dead", "restart", "stuck", "estop")
+DEVICES = (*(row.device for row in REPORTS), *CAMERAS, "robot")
+JOINTS = {"torso": 3, "left_arm": 6, "right_arm": 6}
+
+
+@dc.dataclass
+class FaultConfig:
+    """One entry of the scenario's key `faults`."""
+
+    kind: str = "latency"
+    device: str = ""
+    mode: str = ""  # begins with this mode; "": with the run
+    start: float = 0.0  # after that [s]
+    duration: float = 0.0  # 0: to the end [s]
+    share: float = 0.0  # of messages
+    delay: float = 0.0  # [s]
+    jitter: float = 0.0  # half the width of an even spread [s]
+    joint: int = 0
+
+    def check(self) -> None:
+        require(self.kind in WIRE + DEVICE, "faults.kind", " or ".join(WIRE + DEVICE), self.kind)
+        require(self.device in ("", *DEVICES), "faults.device", f'"" or one of {", ".join(DEVICES)}', self.device)
+        require(self.mode in ("", *Mode), "faults.mode", f'"" or one of {", ".join(Mode)}', self.mode)
+        for key, high in (("start", 3600), ("duration", 3600), ("share", 1), ("delay", 5), ("jitter", 5)):
+            require_in(getattr(self, key), 0, high, f"faults.{key}")
+        require(self.jitter <= self.delay, "faults.jitter", "not above the delay", self.jitter)
+        if self.kind == "restart":
+            require(self.duration > 0, "faults.duration", "> 0 for a restart", self.duration)
+        if self.kind == "stuck":
+            count = JOINTS.get(self.device, 0)
+            require(count > 0, "faults.device", f"one of {', '.join(JOINTS)} for stuck", self.device)
+            require(0 <= self.joint < count, "faults.joint", f"within 0..{count - 1}", self.joint)
+
+
+class Faults:
+    """Which faults act, and what they do. Times are the robot's [s]."""
+
+    def __init__(self, faults: Iterable[FaultConfig], seed: int):
+        self._faults = list(faults)
+        self._draw = [
+            np.random.Generator(np.random.SFC64([seed, zlib.crc32(f"{k} {f.kind} {f.device}".encode())]))
+            for k, f in enumerate(self._faults)
+        ]
+        self._entered: dict[str, float] = {"": 0.0}
+        self._kept: dict[str, Any] = {}  # what a frozen device said last, and where a stuck joint stands
+
+    def enter(self, mode: str, time: float) -> None:
+        """The program has entered a mode."""
+        self._entered.setdefault(mode, time)
+
+    def _window(self, fault: FaultConfig) -> tuple[float, float]:
+        begin = self._entered.get(fault.mode, math.inf) + fault.start
+        return begin, begin + (fault.duration or math.inf)
+
+    def _acting(self, kind: str, device: str, time: float) -> Iterable[tuple[FaultConfig, np.random.Generator]]:
+        for fault, draw in zip(self._faults, self._draw):
+            begin, end = self._window(fault)
+            if fault.kind == kind and fault.device in ("", device) and begin <= time < end:
+                yield fault, draw
+
+    def acts(self, kind: str, device: str, time: float) -> bool:
+        return any(True for _ in self._acting(kind, device, time))
+
+    def silent(self, device: str, time: float) -> bool:
+        """The device neither reports nor listens."""
+        return self.acts("dead", device, time) or self.acts("restart", device, time)
+
+    def clock(self, device: str, time: float) -> float:
+        """The device's clock: it begins anew when a restart is over."""
+        ends = [self._window(f)[1] for f in self._faults if f.kind == "restart" and f.device in ("", device)]
+        return time - max((end for end in ends if end <= time), default=0.0)
+
+    def frozen(self, key: str, time: float, now: Any) -> Any:
+        """`now`, or what was said when it froze."""
+        if self.acts("frozen", CHANNELS[key].device, time):
+            return self._kept.setdefault(key, now)
+        self._kept.pop(key, None)
+        return now
+
+    def stuck(self, device: str, time: float, command: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        """A position command (n,) with the stuck joints where they stand."""
+        for fault, _ in self._acting("stuck", device, time):
+            command = command.copy()
+            command[fault.joint] = self._kept.setdefault(f"{device} {fault.joint}", measured[fault.joint])
+        return command
+
+    def arrivals(self, device: str, time: float) -> list[float]:
+        """When a message that is sent now arrives: no time if it is lost, two if it comes twice."""
+        if any(draw.random() < fault.share for fault, draw in self._acting("loss", device, time)):
+            return []
+        delay = sum(f.delay + f.jitter * draw.uniform(-1, 1) for f, draw in self._acting("latency", device, time))
+        if any(draw.random() < fault.share for fault, draw in self._acting("reorder", device, time)):
+            delay += 1.5 * TICK
+        twice = any(draw.random() < fault.share for fault, draw in self._acting("duplicate", device, time))
+        return [time + delay] * (2 if twice else 1)
+
+
+class Wire:
+    """One direction of the wire with its faults: messages in, and out when they are due."""
+
+    def __init__(self, faults: Faults, deliver: Callable[[str, Any], None], newest_only: bool):
+        """newest_only: of messages of one channel that are due at once the last one only is delivered, as a receiver
+        with room for a single one would have it."""
+        self._faults = faults
+        self._deliver = deliver
+        self._newest_only = newest_only
+        self._waiting: collections.deque[tuple[float, str, Any]] = collections.deque()
+
+    def put(self, key: str, message: Any, time: float) -> None:
+        for when in self._faults.arrivals(CHANNELS[key].device, time):
+            self._waiting.append((when, key, message))
+
+    def pass_on(self, time: float) -> None:
+        """Delivers what is due, first due first."""
+        due = sorted((item for item in self._waiting if item[0] <= time), key=lambda item: item[0])
+        self._waiting = collections.deque(item for item in self._waiting if item[0] > time)
+        if self._newest_only:
+            due = list({key: (when, key, message) for when, key, message in due}.values())
+        for _, key, message in due:
+            self._deliver(key, message)

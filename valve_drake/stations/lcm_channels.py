@@ -1,0 +1,374 @@
+"""What travels between the program and a robot: one table of LCM channels, in Drake's own message types.
+
+`CHANNELS` is all that a driver's author needs; docs/hardware.md shows it as `table()` makes it. `Bus` puts it on the
+wire. The scenario's key `hardware` names the channels, the bus and the times that are kept.
+"""
+
+import dataclasses as dc
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from drake import (
+    lcmt_drake_signal,
+    lcmt_force_torque,
+    lcmt_header,
+    lcmt_iiwa_command,
+    lcmt_iiwa_status,
+    lcmt_image,
+    lcmt_image_array,
+    lcmt_schunk_wsg_command,
+    lcmt_schunk_wsg_status,
+)
+from pydrake.lcm import DrakeLcm
+
+from valve_drake.checks import require, require_in
+from valve_drake.messages import SIDES, CameraFrame
+from valve_drake.ports import SLOT, TICK
+from valve_drake.stations.contract import CAMERAS
+
+PROTOCOL = 1  # version of this table; a robot that speaks another one is refused
+ROBOT, CONTROLLER = "robot", "controller"  # who sends
+MODE, REQUEST, STATE = "controller.mode", "cameras.request", "robot.state"
+SYNC = {ROBOT: "robot.sync", CONTROLLER: "controller.sync"}
+MM = 1e3  # Drake's gripper messages are in mm
+
+Values = dict[str, np.ndarray]  # port of the contract -> its vector
+
+
+class WrongMessage(ValueError):
+    """A message that does not fit its row of the table; the text says how."""
+
+
+@dc.dataclass(frozen=True)
+class Channel:
+    """One row of the table. `key`: its name in the scenario, <device>.<what>."""
+
+    key: str
+    sender: str
+    kind: type
+    rate: str
+    fields: str  # units and signs, for people
+    write: Callable[[Values], Any] | None = None  # values -> message without its stamp; None: made by its sender
+    read: Callable[[Any], Values] | None = None
+    stamp: str = "utime"
+
+    @property
+    def device(self) -> str:
+        return self.key.partition(".")[0]
+
+    @property
+    def default_name(self) -> str:
+        return "VALVE_" + self.key.replace(".", "_").upper()
+
+    def encode(self, utime: int, values: Values) -> Any:
+        message = self.write(values)
+        setattr(message, self.stamp, utime)
+        return message
+
+
+def _count(wanted: int, found: int, what: str) -> None:
+    if found != wanted:
+        raise WrongMessage(f"{found} {what}, want {wanted}")
+
+
+def _signal(port: str, coordinates: tuple[str, ...]) -> tuple[Callable, Callable]:
+    def write(values: Values) -> lcmt_drake_signal:
+        return signal(dict(zip(coordinates, values[port].tolist())))
+
+    def read(message: lcmt_drake_signal) -> Values:
+        _count(len(coordinates), message.dim, "values")
+        return {port: np.array(message.val)}
+
+    return write, read
+
+
+def signal(values: Mapping[str, float]) -> lcmt_drake_signal:
+    """Named numbers as a message."""
+    message = lcmt_drake_signal()
+    message.dim, message.coord, message.val = len(values), list(values), [float(v) for v in values.values()]
+    return message
+
+
+def _joint_command(port: str, n: int) -> tuple[Callable, Callable]:
+    def write(values: Values) -> lcmt_iiwa_command:
+        message = lcmt_iiwa_command()
+        message.num_joints, message.joint_position = n, values[port].tolist()
+        return message
+
+    def read(message: lcmt_iiwa_command) -> Values:
+        _count(n, message.num_joints, "joints")
+        return {port: np.array(message.joint_position)}
+
+    return write, read
+
+
+def _joint_status(position: str, n: int, velocity: str = "", torque: str = "") -> tuple[Callable, Callable]:
+    def write(values: Values) -> lcmt_iiwa_status:
+        zeros = [0.0] * n
+        message = lcmt_iiwa_status()
+        message.num_joints = n
+        message.joint_position_measured = values[position].tolist()
+        message.joint_velocity_estimated = values[velocity].tolist() if velocity else zeros
+        message.joint_torque_measured = values[torque].tolist() if torque else zeros
+        message.joint_position_commanded = message.joint_position_ipo = zeros
+        message.joint_torque_commanded = message.joint_torque_external = zeros
+        return message
+
+    def read(message: lcmt_iiwa_status) -> Values:
+        _count(n, message.num_joints, "joints")
+        out = {position: message.joint_position_measured}
+        if velocity:
+            out |= {velocity: message.joint_velocity_estimated, torque: message.joint_torque_measured}
+        return {port: np.array(value) for port, value in out.items()}
+
+    return write, read
+
+
+def _gripper_command(side: str) -> tuple[Callable, Callable]:
+    position, force = f"{side}_gripper.position_command", f"{side}_gripper.force_limit"
+
+    def write(values: Values) -> lcmt_schunk_wsg_command:
+        message = lcmt_schunk_wsg_command()
+        message.target_position_mm, message.force = MM * float(values[position][0]), float(values[force][0])
+        return message
+
+    def read(message: lcmt_schunk_wsg_command) -> Values:
+        return {position: np.array([message.target_position_mm / MM]), force: np.array([message.force])}
+
+    return write, read
+
+
+def _gripper_status(side: str) -> tuple[Callable, Callable]:
+    position, force = f"{side}_gripper.position_measured", f"{side}_gripper.force_measured"
+
+    def write(values: Values) -> lcmt_schunk_wsg_status:
+        message = lcmt_schunk_wsg_status()
+        message.actual_position_mm, message.actual_force = MM * float(values[position][0]), float(values[force][0])
+        return message
+
+    def read(message: lcmt_schunk_wsg_status) -> Values:
+        return {position: np.array([message.actual_position_mm / MM]), force: np.array([message.actual_force])}
+
+    return write, read
+
+
+def _wrench(port: str) -> tuple[Callable, Callable]:
+    def write(values: Values) -> lcmt_force_torque:
+        message = lcmt_force_torque()
+        message.tx, message.ty, message.tz, message.fx, message.fy, message.fz = values[port].tolist()
+        return message
+
+    def read(m: lcmt_force_torque) -> Values:
+        return {port: np.array([m.tx, m.ty, m.tz, m.fx, m.fy, m.fz])}
+
+    return write, read
+
+
+TICKS, ONCE = "every tick, 1/128 s", "robot_period"
+_ARM = "joint_position_measured [rad], joint_velocity_estimated [rad/s], joint_torque_measured [N m, of the actuator]"
+_UNUSED = "the other fields are not read"
+
+
+def _rows() -> Iterable[Channel]:
+    """Commands, reports, cameras, then what keeps the two sides together."""
+    twist, odometry = ("forward", "yaw_rate"), ("x", "y", "heading", "forward", "yaw_rate")
+    yield Channel(
+        "base.command", CONTROLLER, lcmt_drake_signal, TICKS,
+        "forward [m/s], yaw_rate [rad/s, counter-clockwise from above]",
+        *_signal("base.twist_command", twist), stamp="timestamp",
+    )  # fmt: skip
+    joints = "joint_position [rad]; num_torques 0"
+    turns = "waist and neck_yaw to the left, neck_pitch downwards"
+    yield Channel(
+        "torso.command", CONTROLLER, lcmt_iiwa_command, TICKS, f"waist, neck_pitch, neck_yaw: {joints}; {turns}",
+        *_joint_command("torso.position_command", 3),
+    )  # fmt: skip
+    for side in SIDES:
+        yield Channel(
+            f"{side}_arm.command", CONTROLLER, lcmt_iiwa_command, TICKS, f"6 joints, shoulder to wrist: {joints}",
+            *_joint_command(f"{side}_arm.position_command", 6),
+        )  # fmt: skip
+        yield Channel(
+            f"{side}_gripper.command", CONTROLLER, lcmt_schunk_wsg_command, TICKS,
+            "target_position_mm: opening between the pads [mm]; force: limit of the finger actuator, above 0 [N]",
+            *_gripper_command(side),
+        )  # fmt: skip
+    yield Channel(
+        "base.status", ROBOT, lcmt_drake_signal, TICKS,
+        "x, y [m], heading [rad], in the frame where odometry began; forward [m/s], yaw_rate [rad/s]",
+        *_signal("base.odometry", odometry), stamp="timestamp",
+    )  # fmt: skip
+    yield Channel(
+        "torso.status", ROBOT, lcmt_iiwa_status, TICKS,
+        f"waist, neck_pitch, neck_yaw: joint_position_measured [rad], signs as commanded; {_UNUSED}",
+        *_joint_status("torso.position_measured", 3),
+    )  # fmt: skip
+    for side in SIDES:
+        arm = f"{side}_arm."
+        yield Channel(
+            f"{side}_arm.status", ROBOT, lcmt_iiwa_status, TICKS, f"6 joints: {_ARM}; {_UNUSED}",
+            *_joint_status(arm + "position_measured", 6, arm + "velocity_measured", arm + "torque_measured"),
+        )  # fmt: skip
+        yield Channel(
+            f"{side}_gripper.status", ROBOT, lcmt_schunk_wsg_status, TICKS,
+            f"actual_position_mm: opening [mm]; actual_force: on the pads, positive closes [N]; {_UNUSED}",
+            *_gripper_status(side),
+        )  # fmt: skip
+        yield Channel(
+            f"{side}_wrist_sensor.status", ROBOT, lcmt_force_torque, TICKS,
+            "fx..fz [N], tx..tz [N m]: load that the hand puts on the sensor, at and in the sensor's frame, "
+            "gravity and bias included; NaN if the sensor cannot say",
+            *_wrench(f"{side}_wrist.wrench"), stamp="timestamp",
+        )  # fmt: skip
+    for camera in CAMERAS:
+        yield Channel(
+            f"{camera}.image", ROBOT, lcmt_image_array, "while requested, every capture",
+            "one image: JPEG, RGB, 640x480; images[0].header.seq counts captures from 0, .utime is when it was taken; "
+            "both eyes of the head are captured at once and carry the same utime", stamp="",
+        )  # fmt: skip
+    yield Channel(
+        REQUEST, CONTROLLER, lcmt_drake_signal, "request_period",
+        f"{', '.join(CAMERAS)}: 1 while the camera is looked at, else 0; without news for 0.5 s: none",
+        stamp="timestamp",
+    )  # fmt: skip
+    yield Channel(
+        STATE, ROBOT, lcmt_drake_signal, "robot_period",
+        f"protocol: {PROTOCOL}; torso, left_arm, right_arm: how many joints; estop: 1 while it is pressed; "
+        "and 1 for every fault, under the fault's own name", stamp="timestamp",
+    )  # fmt: skip
+    yield Channel(
+        MODE, CONTROLLER, lcmt_drake_signal, "when it changes, for displays and rehearsals",
+        "one coordinate, named as the supervisor's mode: how often a mode was entered so far", stamp="timestamp",
+    )  # fmt: skip
+    for sender in (ROBOT, CONTROLLER):
+        yield Channel(
+            SYNC[sender], sender, lcmt_drake_signal, "lock-step only, last in every tick",
+            "tick: -1 before the start; messages: how many of this table were sent since the start", stamp="timestamp",
+        )  # fmt: skip
+
+
+CHANNELS: dict[str, Channel] = {row.key: row for row in _rows()}
+COMMANDS = tuple(row for row in CHANNELS.values() if row.sender == CONTROLLER and row.write)
+REPORTS = tuple(row for row in CHANNELS.values() if row.sender == ROBOT and row.write)
+IMAGES = {camera: CHANNELS[f"{camera}.image"] for camera in CAMERAS}
+
+
+def table() -> str:
+    """The table in Markdown, for docs/hardware.md."""
+    lines = ["| scenario key | channel | from | type | when | fields, units, signs |", "|---|---|---|---|---|---|"]
+    lines += [
+        f"| {row.key} | {row.default_name} | {row.sender} | {row.kind.__name__} | {row.rate} | {row.fields} |"
+        for row in CHANNELS.values()
+    ]
+    return "\n".join(lines) + "\n"
+
+
+@dc.dataclass
+class HardwareConfig:
+    """Scenario key `hardware`: the bus between the program and the robot, and the times that both keep."""
+
+    lcm_url: str = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=2097152"  # room for four images
+    channels: dict[str, str] = dc.field(
+        default_factory=lambda: {row.key: row.default_name for row in CHANNELS.values()}
+    )
+    lockstep: bool = False  # both sides wait for each other instead of the clock: for rehearsals
+    answer_time: float = 5.0  # a robot that has not reported everything after this long does not answer [s]
+    report_age: float = 0.1  # a wrist sensor silent for longer reads NaN [s]
+    image_age: float = 0.5  # an image older than this is not shown [s]
+    command_age: float = 0.1  # on the robot: without commands for longer its joints stop [s]
+    robot_period: float = 1 / 32  # of robot.state [s]
+    request_period: float = 1 / 32  # of cameras.request [s]
+
+    def check(self) -> None:
+        require(self.lcm_url.partition("://")[0] in ("udpm", "memq"), "hardware.lcm_url", "udpm://... or memq://",
+                self.lcm_url)  # fmt: skip
+        unknown = sorted(set(self.channels) - set(CHANNELS))
+        require(not unknown, "hardware.channels", f"keyed by {', '.join(CHANNELS)}", ", ".join(unknown))
+        names = list(self.channels.values())
+        twice = sorted({name for name in names if names.count(name) > 1 or not name})
+        require(not twice, "hardware.channels", "a name of its own for each channel", ", ".join(twice))
+        for key in ("answer_time", "report_age", "image_age", "command_age"):
+            require_in(getattr(self, key), TICK, 60.0, f"hardware.{key}")
+        for key in ("robot_period", "request_period"):
+            ticks = getattr(self, key) / TICK
+            require(ticks >= 1 and ticks == int(ticks), f"hardware.{key}", "a multiple of 1/128 s", getattr(self, key))
+
+
+def to_utime(time: float) -> int:
+    """Seconds -> microseconds."""
+    return round(1e6 * time)
+
+
+def from_utime(utime: int) -> float:
+    """Microseconds -> seconds; the grid of slots, that lock-step keeps, comes back exactly."""
+    time = utime * 1e-6
+    slot = round(time / SLOT) * SLOT
+    return slot if abs(slot - time) < 1e-6 else time
+
+
+def image_message(frame: CameraFrame) -> lcmt_image_array:
+    """A camera's JPEG as Drake's message."""
+    image = lcmt_image()
+    image.header = lcmt_header()
+    image.header.utime, image.header.seq, image.header.frame_name = to_utime(frame.time), frame.sequence, frame.camera
+    image.height, image.width = frame.image.shape[:2]
+    image.row_stride = 3 * image.width
+    image.data, image.size = frame.data, len(frame.data)
+    image.pixel_format, image.channel_type = image.PIXEL_FORMAT_RGB, image.CHANNEL_TYPE_UINT8
+    image.compression_method = image.COMPRESSION_METHOD_JPEG
+    message = lcmt_image_array()
+    message.header, message.num_images, message.images = image.header, 1, [image]
+    return message
+
+
+def read_image(message: lcmt_image_array) -> lcmt_image:
+    """The only image of a message. Raises WrongMessage."""
+    _count(1, message.num_images, "images")
+    image = message.images[0]
+    if image.compression_method != image.COMPRESSION_METHOD_JPEG:
+        raise WrongMessage("an image that is not JPEG")
+    return image
+
+
+class Bus:
+    """One side's ends of all channels.
+
+    heard(key, message): called from `pump` for what the other side sent; the message is None if it is of another type.
+    """
+
+    def __init__(self, config: HardwareConfig, lcm: DrakeLcm | None = None):
+        self.config = config
+        self.lcm = DrakeLcm(config.lcm_url) if lcm is None else lcm
+        self.sent = 0  # messages, those of SYNC left out
+        self._names = {key: config.channels.get(key, row.default_name) for key, row in CHANNELS.items()}
+
+    def listen(self, sender: str, heard: Callable[[str, Any], None]) -> None:
+        """Hears all that `sender` says."""
+        for row in CHANNELS.values():
+            if row.sender == sender:
+                self.lcm.Subscribe(self._names[row.key], lambda data, row=row: heard(row.key, _decoded(row, data)))
+
+    def send(self, key: str, message: Any) -> None:
+        self.lcm.Publish(self._names[key], message.encode())
+        self.sent += key not in SYNC.values()
+
+    def say(self, key: str, utime: int, values: Mapping[str, float]) -> None:
+        """Named numbers on a channel."""
+        message = signal(values)
+        message.timestamp = utime
+        self.send(key, message)
+
+    def pump(self, wait: float = 0.0) -> bool:
+        """Hands out what has arrived; waits up to `wait` seconds for something -> whether there was any."""
+        return self.lcm.HandleSubscriptions(int(1e3 * wait)) > 0
+
+    def name(self, key: str) -> str:
+        return self._names[key]
+
+
+def _decoded(row: Channel, data: bytes) -> Any | None:
+    try:
+        return row.kind.decode(data)
+    except Exception:  # ValueError for another type; damaged bytes make a decoder raise anything
+        return None

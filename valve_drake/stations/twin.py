@@ -1,0 +1,356 @@
+"""The twin: a station, simulated, as the robot at the other end of the wire, with a robot's own guard and its faults.
+
+What a robot's own side does, whatever the program asks:
+
+- commands older than `hardware.command_age`: the base stops, joints hold where they were measured, fingers stay; with
+  new commands the joints go to them slowly;
+- a command that is not finite or absurd is refused, and counts as none;
+- the emergency stop stops base and joints and leaves the fingers to their commands, so that a hand can be opened.
+
+Both are reported as faults. The twin's time is its own: paced by the wall's clock, or in lock-step with the program.
+"""
+
+import math
+import os
+import time as wall
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydrake.lcm import DrakeLcm
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Diagram
+
+from valve_drake.messages import CameraFrame
+from valve_drake.motion import slew
+from valve_drake.ports import SLOT, TICK
+from valve_drake.stations.camera_rig import Capture
+from valve_drake.stations.camera_workers import CameraWorkers
+from valve_drake.stations.contract import CAMERAS, CONTRACT
+from valve_drake.stations.faults import JOINTS, Faults, Wire
+from valve_drake.stations.lcm_channels import (
+    CHANNELS,
+    COMMANDS,
+    CONTROLLER,
+    IMAGES,
+    MODE,
+    PROTOCOL,
+    REPORTS,
+    REQUEST,
+    ROBOT,
+    STATE,
+    SYNC,
+    Bus,
+    HardwareConfig,
+    Values,
+    WrongMessage,
+    image_message,
+    signal,
+    to_utime,
+)
+from valve_drake.stations.simulation_config import CameraConfig
+
+VECTORS = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and isinstance(spec.kind, int))
+FAULT_TIME = 0.5  # a refused command is reported for as long [s]
+REQUEST_AGE = 0.5  # of a camera request before the cameras stop [s]
+FAR = 0.5  # from the measured position, a joint's command is absurd [rad]
+FAST = (2.0, 3.0)  # base twist that is absurd [m/s, rad/s]
+GRIP = (0.2, 200.0)  # opening and force that are absurd [m, N]
+BACK = 0.3  # speed of a joint that was stopped, back to its commands [rad/s]
+GONE = 3.0  # paced: a program that was silent for so long has gone [s]
+IDLE = 0.05  # lock-step: between two reports before the start [s, wall]
+
+
+class LiveImages(CameraWorkers):
+    """Images made when they are captured, if somebody wants them, and fetched when they are ready; nobody waits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wanted: set[str] = set()
+
+    def start(self, *rig: object) -> "LiveImages":
+        super().start(*rig)
+        for worker in self._workers:  # rather a late image than a late tick
+            os.setpriority(os.PRIO_PROCESS, worker.process.pid, os.getpriority(os.PRIO_PROCESS, 0) + 5)
+        return self
+
+    def captured(self, name: str, capture: Capture) -> None:
+        if capture.sequence == 0:  # the first image takes a renderer seconds, and nobody has asked for it
+            self._ask(name, capture)
+            while (name, 0) not in self._made:
+                self._receive(name)
+            del self._asked[name][0], self._made[name, 0]
+            return
+        busy = sum(k not in self._made for k in ((name, s) for s in self._asked[name]))
+        if name in self.wanted and busy < 2:  # a camera that cannot keep up drops images
+            self._ask(name, capture)
+
+    def ready(self) -> list[CameraFrame]:
+        """Those that came since the last call."""
+        for name in CAMERAS[:2]:
+            while self._workers and self._worker(name).wire.poll():
+                self._receive(name)
+        frames = list(self._made.values())
+        for frame in frames:
+            del self._asked[frame.camera][frame.sequence]
+        self._made.clear()
+        return frames
+
+
+class Guard:
+    """The robot's own judgement of commands: what the joints are really told."""
+
+    def __init__(self, start: Mapping[str, np.ndarray], age: float):
+        """start: port -> vector: what holds until the first command. age: of commands [s]."""
+        self._told = dict(start)
+        self._arrived: dict[str, float] = {}
+        self._stopped: dict[str, Values] = {}  # channel -> what its device holds meanwhile
+        self._refused: dict[str, tuple[str, float]] = {}
+        self._age = age
+
+    def take(self, key: str, values: Values, measured: Values, time: float) -> None:
+        """A command that has arrived."""
+        if problem := _problem(CHANNELS[key].device, values, measured):
+            self._refused[key] = (problem, time)
+            return
+        self._told |= values
+        self._arrived[key] = time
+
+    def _late(self, key: str, time: float) -> bool:
+        return time - self._arrived.get(key, time) > self._age
+
+    def targets(self, measured: Values, estop: bool, time: float) -> Values:
+        """What the joints are told now: contract's input ports -> vectors. To be called once a tick.
+
+        A joint that was stopped goes slowly to where it is commanded afterwards, however far that is by then.
+        """
+        for row in COMMANDS:
+            if row.device.endswith("gripper"):
+                continue
+            stop = estop or self._late(row.key, time)
+            if row.device == "base":
+                self._stopped[row.key] = {"base.twist_command": np.zeros(2)} if stop else {}
+                continue
+            port = f"{row.device}.position_"
+            held = self._stopped.get(row.key, {}).get(port + "command")
+            if stop and held is None:
+                held = measured[port + "measured"]
+            elif not stop and held is not None:
+                held = slew(held, self._told[port + "command"], BACK * TICK)
+                held = None if np.array_equal(held, self._told[port + "command"]) else held
+            self._stopped[row.key] = {} if held is None else {port + "command": held}
+        return {port: value for values in (self._told, *self._stopped.values()) for port, value in values.items()}
+
+    def faults(self, time: float) -> list[str]:
+        """What the robot says of the commands."""
+        words = [f"{row.key} late" for row in COMMANDS if self._late(row.key, time)]
+        return words + [f"{key} refused: {p}" for key, (p, when) in self._refused.items() if time - when <= FAULT_TIME]
+
+
+def _problem(device: str, values: Values, measured: Values) -> str:
+    """Why a command is refused, or ""."""
+    if not all(np.isfinite(value).all() for value in values.values()):
+        return "not finite"
+    if device == "base":
+        return "" if np.all(np.abs(values["base.twist_command"]) <= FAST) else "too fast"
+    if device in JOINTS:
+        far = np.max(np.abs(values[f"{device}.position_command"] - measured[f"{device}.position_measured"]))
+        return "" if far <= FAR else f"{far:.2f} rad off the measured position"
+    opening, force = (float(value[0]) for value in values.values())
+    return "" if -1e-3 <= opening <= GRIP[0] and 0 <= force <= GRIP[1] else "out of range"
+
+
+class Twin:
+    """A simulated station behind LCM.
+
+    station: its inputs are the robot's joints, its outputs its sensors. start: what its inputs hold at first.
+    """
+
+    def __init__(
+        self,
+        station: Diagram,
+        start: Mapping[str, np.ndarray],
+        hardware: HardwareConfig,
+        camera: CameraConfig,
+        faults: Faults,
+        *,
+        images: LiveImages | None = None,
+        lcm: DrakeLcm | None = None,
+    ):
+        self.station = station
+        self.simulator = Simulator(station)
+        self.context = self.simulator.get_mutable_context()
+        self.tick = 0
+        self.gone = False  # the program has left
+        self.faults = faults
+        self._hardware = hardware
+        self._camera = camera
+        self._images = images
+        self._bus = Bus(hardware, lcm)
+        newest = hardware.lockstep and not self._bus.lcm.get_lcm_url().startswith("memq")
+        self._out = Wire(faults, self._bus.send, newest)
+        self._in = Wire(faults, self._obey, newest)
+        self._guard = Guard(start, hardware.command_age)
+        self._requested: tuple[float, set[str]] = (-math.inf, set())
+        self._shown = dict.fromkeys(CAMERAS, -1)  # sequence sent last
+        self._heard = 0  # messages since the start of lock-step
+        self._heard_at = math.inf  # wall time of the last one
+        self._sync = (-3, 0)
+        self._sent_before = 0
+        self._started = not hardware.lockstep
+        self._idle_at = -math.inf
+        self._bus.listen(CONTROLLER, self._hear)
+        self._set(start)
+        self.simulator.Initialize()
+        if images is not None:
+            self.simulator.AdvanceTo(SLOT / 2)  # the first captures
+
+    @property
+    def time(self) -> float:
+        """Of the present tick [s]."""
+        return self.tick * TICK
+
+    def read(self, port: str) -> np.ndarray:
+        return self.station.GetOutputPort(port).Eval(self.context)
+
+    def _set(self, values: Mapping[str, np.ndarray]) -> None:
+        for port, value in values.items():
+            self.station.GetInputPort(port).FixValue(self.context, value)
+
+    # ------------------------------------------------------------ what it hears
+    def _hear(self, key: str, message: Any) -> None:
+        self._heard_at = wall.monotonic()
+        if key == SYNC[CONTROLLER]:
+            self._sync = (int(message.val[0]), int(message.val[1]))
+            return
+        self._heard += 1
+        if message is not None:
+            self._in.put(key, message, self.time)
+
+    def _obey(self, key: str, message: Any) -> None:
+        """A message that has come through the wire."""
+        if self.faults.silent(CHANNELS[key].device, self.time):
+            return
+        if key == REQUEST:
+            self._requested = (self.time, {name for name, value in zip(message.coord, message.val) if value})
+        elif key == MODE:
+            self.faults.enter(message.coord[0], self.time)
+        else:
+            try:
+                self._guard.take(key, CHANNELS[key].read(message), self._measured, self.time)
+            except WrongMessage:
+                pass  # counts as none
+
+    # ------------------------------------------------------------ one tick
+    def report(self) -> None:
+        """Publishes what the sensors show now."""
+        time, values = self.time, self._sense()
+        for row in REPORTS:
+            if self.faults.silent(row.device, time):
+                continue
+            said = self.faults.frozen(row.key, time, values)
+            if self.faults.acts("nan", row.device, time):
+                said = {port: np.full_like(value, np.nan) for port, value in said.items()}
+            self._say(row.key, row.encode(to_utime(self.faults.clock(row.device, time)), said))
+        for frame in self._frames(time):
+            self._put_image(frame, time)
+        if self.tick % round(self._hardware.robot_period / TICK) == 0 and not self.faults.silent("robot", time):
+            state = {"protocol": PROTOCOL, **JOINTS, "estop": self.faults.acts("estop", "robot", time)}
+            state |= dict.fromkeys(self._guard.faults(time), 1.0)
+            message = signal(state)
+            message.timestamp = to_utime(self.faults.clock("robot", time))
+            self._say(STATE, message)
+        self._out.pass_on(time)
+        if self._started:
+            self.simulator.AdvanceTo(time + 3 * SLOT)  # what does not depend on the answer
+
+    def _say(self, key: str, message: Any) -> None:
+        if self._started:
+            self._out.put(key, message, self.time)
+        else:  # time stands still: nothing is late, and chance has not begun
+            self._bus.send(key, message)
+
+    def _sense(self) -> Values:
+        self._measured = {name: self.read(name) for name in VECTORS}
+        return self._measured
+
+    def _frames(self, time: float) -> list[CameraFrame]:
+        """Images that are there and were asked for."""
+        asked, wanted = self._requested
+        if time - asked > REQUEST_AGE:
+            wanted = set()
+        if self._images is not None:
+            self._images.wanted = wanted
+            return self._images.ready()
+        frames = []
+        for camera in sorted(wanted):
+            period = self._camera.head_period if camera.startswith("head") else self._camera.wrist_period
+            there = math.floor((time - TICK - self._camera.latency) / period)  # delivered before this tick
+            if there > self._shown[camera]:
+                frame = self.read(f"{camera}.image")
+                self._shown[camera] = frame.sequence
+                frames.append(frame)
+        return frames
+
+    def _put_image(self, frame: CameraFrame, time: float) -> None:
+        key = IMAGES[frame.camera].key
+        if not self.faults.silent(frame.camera, time):
+            shown = self.faults.frozen(key, time, frame)
+            if shown is not frame:
+                shown = CameraFrame(frame.camera, frame.time, frame.sequence, shown.image, shown.data)
+            self._say(key, image_message(shown))
+
+    def move(self) -> None:
+        """Takes the commands that have arrived, which reach the joints in slot 3, and moves on to the next tick."""
+        time = self.time
+        self._in.pass_on(time)
+        targets = self._guard.targets(self._measured, self.faults.acts("estop", "robot", time), time)
+        for device in JOINTS:
+            port = f"{device}.position_command"
+            measured = self._measured[f"{device}.position_measured"]
+            targets[port] = self.faults.stuck(device, time, targets[port], measured)
+        self._set(targets)
+        self.simulator.AdvanceTo(time + TICK)
+        self.tick += 1
+
+    # ------------------------------------------------------------ lock-step
+    def poll(self) -> None:
+        """Lock-step: does what can be done now, without waiting for the program."""
+        self._bus.pump()
+        if not self._started:
+            if self._sync[0] == -1:
+                self._started, self._sent_before, self._heard = True, self._bus.sent, 0
+                self._report_tick()
+            elif wall.monotonic() - self._idle_at > IDLE:
+                self._idle_at = wall.monotonic()
+                self.report()
+                self._bus.say(SYNC[ROBOT], 0, {"tick": -1, "messages": 0})
+        elif self._sync[0] == -2:
+            self.gone = True
+        elif self._sync == (self.tick, self._heard):
+            self.move()
+            self._report_tick()
+
+    def wait(self) -> None:
+        """Lock-step: as `poll`, leaving the processor to others while the program thinks."""
+        before = self.tick
+        self.poll()
+        if self.tick == before:
+            wall.sleep(2e-4)
+
+    def _report_tick(self) -> None:
+        self.report()
+        sent = self._bus.sent - self._sent_before
+        self._bus.say(SYNC[ROBOT], to_utime(self.time), {"tick": self.tick, "messages": sent})
+
+    # ------------------------------------------------------------ paced
+    def pass_time(self, seconds: float) -> None:
+        """Listens while there is nothing else to do: a channel has room for one message."""
+        wall.sleep(min(seconds, 2e-3))
+        self._bus.pump()
+
+    def hear(self) -> None:
+        """Paced: takes in what has arrived."""
+        while self._bus.pump():
+            pass
+        self.gone = wall.monotonic() - self._heard_at > GONE
