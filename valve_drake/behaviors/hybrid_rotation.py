@@ -51,8 +51,8 @@ AT_VALVE = (Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE)  # the 
 class HybridRotationConfig:
     """Scenario key `hybrid_rotation`."""
 
-    damping: float = 2500.0  # D, of each hand [N s/m]
-    angular_damping: float = 160.0  # [N m s/rad]
+    damping: float = 4000.0  # D, of each hand: stable with 30 ms of delay on the way to the robot [N s/m]
+    angular_damping: float = 256.0  # [N m s/rad]
     filter: float = 10.0  # low-pass of the wrenches [Hz]
     rate: float = 0.105  # of the turn [rad/s]
     ramp: float = 0.5  # to full rate and back [s]
@@ -68,7 +68,7 @@ class HybridRotationConfig:
     grip_force: float = 70.0  # of the finger actuator [N]
     grip_margin: float = 0.005  # opening off the handle's width that is no grasp [m]
     tug_force: float = 8.0  # that proves the grasp, each hand [N]
-    tug_speed: float = 0.01  # [m/s]
+    tug_speed: float = 0.006  # times `damping`: most of its force on a hand [m/s]
     tug_reach: float = 0.012  # without force: missed [m]
     close_time: float = 4.0  # deadline for closing [s]
     relax: float = 0.6  # bleeding the wrenches before opening [s]
