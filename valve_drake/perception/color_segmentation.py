@@ -173,7 +173,7 @@ def _contrast(share: np.ndarray, config: ColorSegmentationConfig) -> np.ndarray:
     size = share.shape[::-1]
     small = cv2.resize(share, [max(n // _COARSE, 1) for n in size], interpolation=cv2.INTER_AREA)
     counts = cv2.calcHist([small], [0], None, [256], [0, 256])[:, 0]
-    small = cv2.max(small, float(np.searchsorted(np.cumsum(counts), small.size / 2)))
+    small = np.maximum(small, np.uint8(np.searchsorted(np.cumsum(counts), small.size / 2)))
     means = []
     for box in (config.small_box, config.large_box):
         # A neighbourhood larger than the image would read past its reflection.

@@ -19,15 +19,21 @@ import numpy as np
 
 from valve_drake.perception.marker import NEXT
 
-_BEFORE = [3, 0, 1, 2]
+_BEFORE = np.array([3, 0, 1, 2])
+_MEETING = np.array([0, 1, 2, 3, 3, 0, 1, 2])
 NODES = (1 - 1 / np.sqrt(3)) / 2, (1 + 1 / np.sqrt(3)) / 2  # of a side's length, from its first corner
-# A side's own unknowns: two levels outside, two of the step, its shift, turn and bend, the blur.
-_FUNCTION = np.array([0, 0, 1, 1, 2, 2, 2, 3])  # 1, rise, d/d shift, d/d blur ...
-_POWER = np.array([0, 1, 0, 1, 0, 1, 2, 0])  # ... times this function of the place along the side
+# A side's own unknowns: two levels outside, two of the step, its shift, turn and bend, the blur. Common unknowns:
+# plane outside (3), plane of the step (3), four shifts (3 each), the blur; _COMMON (4, 8, 19) makes a side's of them.
+_COMMON = np.zeros((4, 8, 19))
+_COMMON[:, [0, 2], [0, 3]] = _COMMON[:, 7, 18] = 1
+for _k in range(4):
+    _COMMON[_k, [4, 5, 6], [6 + 3 * _k, 7 + 3 * _k, 8 + 3 * _k]] = 1
 _LEVELS, _BLUR = slice(0, 4), 7
 _BENDS = [8, 11, 14, 17]  # of the four sides among the common unknowns
 _UNEVEN = 2.5  # chi^2 per degree of freedom by which the sides' levels may contradict common planes
+_ROWS = np.arange(8)  # of the nodes
 _WINDOW = 7  # half the square of pixels looked at round a corner [px]
+_SQUARE = np.mgrid[-_WINDOW : _WINDOW + 1, -_WINDOW : _WINDOW + 1][::-1].reshape(2, -1).T  # its pixels (n, 2)
 _OUTSIDE = 2.0  # of a side: pixels used at a corner [px]
 _SHORT = 2 * _WINDOW + 2  # sides below have no corner pixels of their own [px]
 _CUT = 4.5  # a pixel further from the model is not the marker's [sigma]
@@ -54,18 +60,22 @@ class Curves:
     def cosine(self) -> np.ndarray:
         return 1 / np.sqrt(1 + self.slope**2)
 
-    def basis(self, t: np.ndarray) -> np.ndarray:
-        """(S, n) -> (S, n, 3) of tau, -1..1 from the first to the last profile."""
-        return basis(2 * (t - self.first[:, None]) / (self.count[:, None] - 1.0) - 1)
+    def tau(self, t: np.ndarray) -> np.ndarray:
+        """(S, n) -> (S, n): -1..1 from the first to the last profile."""
+        return 2 * (t - self.first[:, None]) / (self.count[:, None] - 1.0) - 1
 
     def across(self, t: np.ndarray) -> np.ndarray:
         """(S, n) -> (S, n) [px]"""
-        return self.start[:, None] + self.slope[:, None] * t + (self.basis(t) @ self.coefficient[:, :, None])[..., 0]
+        tau = self.tau(t)
+        c = self.coefficient.T[:, :, None]
+        return (self.start[:, None] + c[0] - c[2] / 3) + self.slope[:, None] * t + tau * (c[1] + tau * c[2])
 
     def points(self, t: np.ndarray) -> np.ndarray:
         """(S, n) -> (S, n, 2) [px]"""
-        both = np.stack([t, self.across(t)], -1)
-        return np.where(self.flat[:, None, None], both, both[..., ::-1])
+        y, flat = self.across(t), self.flat[:, None]
+        out = np.empty((*y.shape, 2))
+        out[..., 0], out[..., 1] = np.where(flat, t, y), np.where(flat, y, t)
+        return out
 
     def normals(self) -> np.ndarray:
         """(S, 2) unit, inward, at the middle."""
@@ -75,7 +85,9 @@ class Curves:
 
 def basis(tau: np.ndarray) -> np.ndarray:
     """1, tau, and a bend that is nil at Gauss's nodes of -1..1."""
-    return np.stack([np.ones_like(tau), tau, tau**2 - 1 / 3], -1)
+    out = np.empty((*tau.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = 1, tau, tau * tau - 1 / 3
+    return out
 
 
 @dc.dataclass(frozen=True)
@@ -101,24 +113,22 @@ def sums(
     tau: np.ndarray,
 ) -> Sums:
     """weight, rise, gain, z, residual: (S, N, M) of each pixel; good, tau (S, N) of each profile."""
-    functions = (None, rise, -gain, -gain * z)
-
-    def dot(a: np.ndarray, b: np.ndarray | None) -> np.ndarray:
-        return good * (a.sum(-1) if b is None else np.einsum("snm,snm->sn", a, b))
-
-    gram = np.empty((4, 4, *good.shape))
-    right = np.empty((4, *good.shape))
-    for i, f in enumerate(functions):
-        weighted = weight if f is None else weight * f
-        right[i] = dot(weighted, residual)
-        for j in range(i + 1):
-            gram[i, j] = gram[j, i] = dot(weighted, functions[j])
-    powers = basis(tau)[:, :, _POWER]
+    S, N, M = weight.shape
+    values = np.empty((S, 9, N, M), np.float32)  # the eight functions of a side, and the residual
+    values[:, 0], values[:, 2], values[:, 8] = 1, rise, residual
+    values[:, 1] = by_tau = np.broadcast_to(tau.astype(np.float32)[:, :, None], weight.shape).copy()
+    np.negative(gain, out=values[:, 4])
+    np.multiply(values[:, 2], by_tau, out=values[:, 3])
+    np.multiply(values[:, 4], by_tau, out=values[:, 5])
+    np.multiply(values[:, 4], by_tau * by_tau - np.float32(1 / 3), out=values[:, 6])
+    np.multiply(values[:, 4], z, out=values[:, 7])
+    weighted = values * (weight * good.astype(np.float32)[:, :, None])[:, None]
+    products = (weighted.reshape(S, 9, -1) @ values.reshape(S, 9, -1).transpose(0, 2, 1)).astype(float)
     return Sums(
-        normal=np.einsum("ijsn,sni,snj->sij", gram[np.ix_(_FUNCTION, _FUNCTION)], powers, powers),
-        right=np.einsum("isn,sni->si", right[_FUNCTION], powers),
-        square=dot(weight * residual, residual).sum(-1),
-        pixels=dot(weight, None).sum(-1),
+        normal=products[:, :8, :8],
+        right=products[:, :8, 8],
+        square=products[:, 8, 8],
+        pixels=weighted[:, 0].sum((1, 2), dtype=float),
     )
 
 
@@ -139,23 +149,21 @@ def joint_fit(
     light is not that of two planes.
     """
     middle = curves.points(curves.first[:, None] + (curves.count[:, None] - 1) * np.array([0.0, 0.5, 1.0]))
-    centre, size = middle[:, 1].mean(0), np.ptp(middle[:, 1], axis=0).max()
+    halves = middle[:, 1]
+    centre, size = halves.sum(0) / 4, (halves.max(0) - halves.min(0)).max()
     place = (middle - centre) / size
-    # Common unknowns: plane outside (3), plane of the step (3), four shifts (3 each), the blur.
-    T = np.zeros((4, 8, 19))
-    T[:, [0, 2], [0, 3]] = 1
+    T = _COMMON.copy()
     T[:, 0, 1:3] = T[:, 2, 4:6] = place[:, 1]
     T[:, 1, 1:3] = T[:, 3, 4:6] = (place[:, 2] - place[:, 0]) / 2
-    for k in range(4):
-        T[k, [4, 5, 6], [6 + 3 * k, 7 + 3 * k, 8 + 3 * k]] = 1
-    T[:, 7, 18] = 1
-    planes = np.linalg.lstsq(T[:, _LEVELS, :6].reshape(16, 6), level.ravel(), rcond=None)[0]
+    to_levels = T[:, _LEVELS, :6].reshape(16, 6)
+    planes = np.linalg.solve(to_levels.T @ to_levels, to_levels.T @ level.ravel())
     off = np.zeros((4, 8))
-    off[:, _LEVELS] = level - T[:, _LEVELS, :6] @ planes
+    off[:, _LEVELS] = level - (to_levels @ planes).reshape(4, 4)
     right = seen.right + (seen.normal @ off[:, :, None])[..., 0]
-    H = (T.transpose(0, 2, 1) @ seen.normal @ T).sum(0)
+    flat_T = T.reshape(32, 19)
+    H = flat_T.T @ (seen.normal @ T).reshape(32, 19)
     H[_BENDS, _BENDS] += bend
-    b = (T.transpose(0, 2, 1) @ right[:, :, None]).sum((0, 2))
+    b = flat_T.T @ right.ravel()
     step = np.linalg.solve(H, b)
     lost = float((off * (seen.right + right)).sum() - b @ step)
 
@@ -167,15 +175,16 @@ def joint_fit(
     if not 0 < lost - apart < 10 * _UNEVEN * variance:
         return None
 
+    per_shift = (curves.inward / curves.cosine())[:, None]
+
     def moved(step: np.ndarray) -> Curves:
-        shift = step[6:18].reshape(4, 3) * (curves.inward / curves.cosine())[:, None]
+        shift = step[6:18].reshape(4, 3) * per_shift
         return dc.replace(curves, coefficient=curves.coefficient + shift)
 
     ends = _corners(moved(step))
     if not np.isfinite(ends).all():
         return None
-    lengths = np.linalg.norm(ends[NEXT] - ends, axis=1)
-    if lengths.min() > _SHORT:
+    if ((ends[NEXT] - ends) ** 2).sum(1).min() > _SHORT**2:
         J, r = _corner_pixels(channel, moved(step), ends, planes + step[:6], blur + step[18], (centre, size), variance)
         H = H + J.T @ J
         step = step + np.linalg.solve(H, J.T @ r)
@@ -184,8 +193,7 @@ def joint_fit(
     starts, stops = (np.where(final.flat, p[:, 0], p[:, 1]) for p in (ends, ends[NEXT]))
     t = starts[:, None] + (stops - starts)[:, None] * np.array(NODES)
     K = np.zeros((8, 19))
-    for k, values in enumerate(final.basis(t)):  # undistorted, a side has no bend
-        K[2 * k : 2 * k + 2, 6 + 3 * k : 8 + 3 * k] = values[:, :2]
+    K[_ROWS, _ROWS // 2 * 3 + 6], K[_ROWS, _ROWS // 2 * 3 + 7] = 1, final.tau(t).ravel()  # undistorted, none has a bend
     chi2, n = scatter
     spread = (chi2 / variance + _PRIOR_POINTS) / (n + _PRIOR_POINTS)
     covariance = variance * spread * (K @ np.linalg.solve(H, K.T))
@@ -211,18 +219,21 @@ def _corners(curves: Curves) -> np.ndarray:
     """Where the sides meet, (4, 2) [px]."""
     ends = curves.points(curves.first[:, None] + (curves.count[:, None] - 1) * np.array([0.0, 1.0]))
     d = ends[:, 1] - ends[:, 0]
-    normal = np.stack([-d[:, 1], d[:, 0]], -1)
-    return meet(np.column_stack([normal, -(normal * ends[:, 0]).sum(1)]))
+    lines = np.empty((4, 3))
+    lines[:, 0], lines[:, 1] = -d[:, 1], d[:, 0]
+    lines[:, 2] = -(lines[:, :2] * ends[:, 0]).sum(1)
+    return meet(lines)
 
 
 def meet(lines: np.ndarray) -> np.ndarray:
     """Corners (4, 2) of four sides (4, 3): corner k is where sides k - 1 and k meet."""
     a, b = lines[_BEFORE], lines
-    w = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    x = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
-    y = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    out = np.empty((4, 2))
+    out[:, 0], out[:, 1] = ay * bz - az * by, az * bx - ax * bz
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.stack([x, y], -1) / w[:, None]
+        out /= (ax * by - ay * bx)[:, None]
+    return out
 
 
 def _corner_pixels(
@@ -235,36 +246,41 @@ def _corner_pixels(
     variance: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Jacobian (n, 19) and residual (n,) of the pixels at the corners that no profile holds."""
-    grid = np.arange(-_WINDOW, _WINDOW + 1)
-    offsets = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
-    px = np.rint(ends).astype(int)[:, None] + offsets  # (4, n, 2)
-    keep = ((px >= 0) & (px < [channel.shape[1], channel.shape[0]])).all(-1)
-    both = (curves[np.array(_BEFORE)], curves)
-    d, where = [], []
-    for side in both:
-        t = np.where(side.flat[:, None], px[..., 0], px[..., 1])
-        y = np.where(side.flat[:, None], px[..., 1], px[..., 0])
-        keep &= (t < side.first[:, None]) | (t >= (side.first + side.count)[:, None])
-        d.append((y - side.across(t)) * (side.inward * side.cosine())[:, None])
-        where.append(side.basis(t))
-    near, far = np.minimum(*d), np.maximum(*d)
-    keep &= (near > -_OUTSIDE) & (far > -1) & (near < 4)
-    corner, pixel = np.nonzero(keep)
-    px = px[corner, pixel]
-    a, b = d[0][corner, pixel] / blur, d[1][corner, pixel] / blur
+    px = np.rint(ends).astype(int)[:, None] + _SQUARE  # (4, n, 2)
+    sides = curves[_MEETING]  # those that begin at the corners, then those that end there
+    flat, first = sides.flat[:, None], sides.first[:, None]
+    u, v = np.concatenate([px, px]).transpose(2, 0, 1)
+    t, y = np.where(flat, u, v), np.where(flat, v, u)  # (8, n)
+    gap = (y - sides.across(t)) * (sides.inward * sides.cosine())[:, None]
+    beyond = (t < first) | (t >= first + sides.count[:, None])
+    near, far = np.minimum(gap[:4], gap[4:]), np.maximum(gap[:4], gap[4:])
+    u, v = u[:4], v[:4]
+    keep = (u >= 0) & (v >= 0) & (u < channel.shape[1]) & (v < channel.shape[0])
+    keep &= beyond[:4] & beyond[4:] & (near > -_OUTSIDE) & (far > -1) & (near < 4)
+    kept = np.flatnonzero(keep)
+    corner = kept // len(_SQUARE)
+    px = px.reshape(-1, 2)[kept]
+    b, a = gap.reshape(2, -1)[:, kept] / blur
+    along = basis(sides.tau(t).reshape(2, -1)[:, kept])
     normals = curves.normals()
     rho = (normals[_BEFORE] * normals).sum(1)[corner]
     cover, by_a, by_b = _wedge(a, b, rho)
 
-    place = np.column_stack([np.ones(len(px)), (px - frame[0]) / frame[1]])
+    n = len(px)
+    place = np.empty((n, 3))
+    place[:, 0] = 1
+    place[:, 1:] = (px - frame[0]) / frame[1]
     height = place @ planes[3:]
-    J = np.zeros((len(px), 19))
-    J[:, :3], J[:, 3:6] = place, place * cover[:, None]
-    rows = np.arange(len(px))[:, None]
-    for k, (slope, at) in enumerate(((by_a, where[0]), (by_b, where[1]))):
-        side = (corner + 3 + k) % 4
-        J[rows, 6 + 3 * side[:, None] + np.arange(3)] = (-height * slope / blur)[:, None] * at[corner, pixel]
-    J[:, 18] = -height * (a * by_a + b * by_b) / blur
+    J = np.zeros((n, 19))
+    J[:, :3] = place
+    np.multiply(place, cover[:, None], out=J[:, 3:6])
+    scaled = height / -blur
+    shifts = np.zeros((n, 4, 3))
+    rows = np.arange(n)
+    for values, slope, side in ((along[0], by_b, corner), (along[1], by_a, _BEFORE[corner])):
+        shifts[rows, side] = (scaled * slope)[:, None] * values
+    J[:, 6:18] = shifts.reshape(n, 12)
+    J[:, 18] = scaled * (a * by_a + b * by_b)
     r = channel[px[:, 1], px[:, 0]] - place @ planes[:3] - height * cover
     chi2 = r * r / variance
     good = chi2 < _CUT**2
@@ -276,11 +292,13 @@ def _corner_pixels(
 
 def _wedge(a: np.ndarray, b: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """P(x < a, y < b) of the bivariate normal distribution, to 1e-3 for |rho| < 0.5, and its exact derivatives."""
-    A, B = normal_cdf(a), normal_cdf(b)
-    bell = _density(a) * _density(b)
-    cover = A * B + rho * bell * (1 + rho / 2 * a * b + rho**2 / 6 * (a * a - 1) * (b * b - 1))
     root = np.sqrt(1 - rho**2)
-    return cover, _density(a) * normal_cdf((b - rho * a) / root), _density(b) * normal_cdf((a - rho * b) / root)
+    at = np.stack([a, b, (b - rho * a) / root, (a - rho * b) / root])
+    density = _density(at)
+    cdf = normal_cdf(at, density)
+    series = 1 + rho / 2 * a * b + rho**2 / 6 * (a * a - 1) * (b * b - 1)
+    cover = cdf[0] * cdf[1] + rho * density[0] * density[1] * series
+    return cover, density[0] * cdf[2], density[1] * cdf[3]
 
 
 def _density(z: np.ndarray) -> np.ndarray:
@@ -290,8 +308,14 @@ def _density(z: np.ndarray) -> np.ndarray:
 def normal_cdf(z: np.ndarray, density: np.ndarray | None = None) -> np.ndarray:
     """Phi(z), its density given or not (Abramowitz and Stegun 26.2.17, error < 8e-8)."""
     density = _density(z) if density is None else density
-    a = np.abs(z)
-    u = 1 / (1 + 0.2316419 * a)
-    poly = u * (0.319381530 + u * (-0.356563782 + u * (1.781477937 + u * (-1.821255978 + u * 1.330274429))))
-    tail = density * poly
-    return np.where(z >= 0, 1 - tail, tail)
+    u = np.abs(z)
+    u *= 0.2316419
+    u += 1
+    np.reciprocal(u, out=u)
+    tail = u * 1.330274429
+    for c in (-1.821255978, 1.781477937, -0.356563782, 0.319381530):
+        tail += c
+        tail *= u
+    tail *= density
+    np.subtract(0.5, tail, out=tail)
+    return np.copysign(tail, z, out=tail) + z.dtype.type(0.5)

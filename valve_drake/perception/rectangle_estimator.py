@@ -18,6 +18,7 @@ Which side is which is settled last: green marks, else sizes, else the track, el
 """
 
 import dataclasses as dc
+import functools
 import math
 
 import cv2
@@ -30,6 +31,7 @@ from valve_drake.messages import MarkerEdges, QuadEdges, RectangleEstimate
 from valve_drake.perception.joint_fit import NODES
 from valve_drake.perception.line_fitting import meet, side_lines
 from valve_drake.perception.marker import NEXT, Marker
+from valve_drake.perception.stereo_positioning import turn_between
 
 METHODS = ("refined", "paper")
 _HOPELESS = 1000.0  # chi^2 above the best from which no further start is refined
@@ -43,7 +45,7 @@ _SKEW[0, [7, 5]], _SKEW[1, [2, 6]], _SKEW[2, [3, 1]] = (1, -1), (1, -1), (1, -1)
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a x b of (3,) or (n, 3); numpy's own takes ten times as long on a few vectors."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]).T
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]).T
 
 
 @dc.dataclass
@@ -261,7 +263,8 @@ def _view(
 
 def _joining(corners: np.ndarray) -> np.ndarray:
     """The lines (4, 3) of the sides between corners (4, 2), positive inside; unit normals."""
-    q = np.column_stack([corners, np.ones(4)])
+    q = np.ones((4, 3))
+    q[:, :2] = corners
     lines = _cross(q, q[NEXT])
     return lines / np.hypot(lines[:, 0], lines[:, 1])[:, None]
 
@@ -307,9 +310,7 @@ def _side_moments(
 
 def _aligned(left: _View, right: _View) -> _View:
     """The right view with its sides counted from the same corner as the left one's."""
-    a = left.corners - left.corners.mean(0)
-    b = right.corners - right.corners.mean(0)
-    turn = min(range(4), key=lambda k: float(((a - np.roll(b, -k, axis=0)) ** 2).sum()))
+    turn = turn_between(left.corners, right.corners)
     if turn == 0:
         return right
     lines, corners, scale = (np.roll(a, -turn, axis=0) for a in (right.lines, right.corners, right.scale))
@@ -370,7 +371,7 @@ def _point_residuals(view: _View, fit: _Fit, model: np.ndarray) -> np.ndarray:
         P = P @ frames.rot_y(fit.yaw)
     h = _cross(P, P[NEXT])
     line = (h / np.hypot(h[:, 0], h[:, 1])[:, None])[view.side]
-    return ((line[:, :2] * view.points).sum(1) + line[:, 2]) * view.scale[view.side]
+    return (line[:, 0] * view.points[:, 0] + line[:, 1] * view.points[:, 1] + line[:, 2]) * view.scale[view.side]
 
 
 def _weights(view: _View, residual: np.ndarray, config: RectangleEstimatorConfig) -> np.ndarray:
@@ -387,6 +388,17 @@ def _weights(view: _View, residual: np.ndarray, config: RectangleEstimatorConfig
 # ---------------------------------------------------------------- refined: least squares on the known rectangle
 
 
+@functools.lru_cache(maxsize=16)
+def _model_sides(model: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Of the model's sides: e = m_j - m_i (4, 3), and [-[c]x c; -[e]x e] (4, 6, 4), where c = m_i x m_j."""
+    m = np.frombuffer(model).reshape(4, 3)
+    e, c = m[NEXT] - m, _cross(m, m[NEXT])
+    both = np.empty((4, 6, 4))
+    both[:, :3, :3], both[:, 3:, :3] = (c @ -_SKEW).reshape(4, 3, 3), (e @ -_SKEW).reshape(4, 3, 3)
+    both[:, :3, 3], both[:, 3:, 3] = c, e
+    return e, both
+
+
 def _linearize(
     moments: _Moments, model: np.ndarray, R: np.ndarray, p: np.ndarray, yaw: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
@@ -395,22 +407,26 @@ def _linearize(
     if yaw:
         back = np.stack([frames.rot_y(-yaw * right) for right in moments.right])
         R_CL, p_CL = back @ R_CL, np.einsum("cij,cj->ci", back, p_CL)
-    P = (model @ R.T + p) @ R_CL.transpose(0, 2, 1) + p_CL[:, None]  # (C, 4, 3)
-    if not (P[..., 2] > 1e-3).all():
+    # With A = R_CL R and t = R_CL p + p_CL a corner m is at P = A m + t, so h = A c + t x (A e).
+    A, t = R_CL @ R, R_CL @ p + p_CL
+    if not (A[:, 2] @ model.T + t[:, 2:]).min() > 1e-3:
         return None
-    D = np.zeros((*P.shape, 7))
-    D[..., :3] = R_CL[:, None] @ (-R @ (model @ _SKEW).reshape(4, 3, 3))
-    D[..., 3:6] = R_CL[:, None]
-    D[..., 0, 6], D[..., 2, 6] = -P[..., 2] * moments.right[:, None], P[..., 0] * moments.right[:, None]  # -e_y x P
-    S = (P @ _SKEW).reshape(*P.shape, 3)
-    h = (S @ P[:, NEXT, :, None])[..., 0]
-    dh = S @ D[:, NEXT] - S[:, NEXT] @ D
-    norm = np.sqrt(h[..., 0] ** 2 + h[..., 1] ** 2)
-    line = h / norm[..., None]
-    dl = (dh - line[..., None] * (line[..., None, :2] @ dh[..., :2, :])) / norm[..., None, None]
-    count = len(line)
-    r = (moments.B @ line.reshape(count, 12, 1)).ravel()
-    return r, (moments.B @ dl.reshape(count, 12, 7)).reshape(-1, 7)
+    count = len(A)
+    e, both = _model_sides(model.tobytes())
+    of_both = np.concatenate([A, (t @ _SKEW).reshape(count, 3, 3) @ A], -1)
+    turned = of_both[:, None] @ both  # (C, 4, 3, 4)
+    dh = np.zeros((count, 4, 3, 8))  # by theta, p, yaw; the last column is h itself
+    dh[..., :3], dh[..., 7] = turned[..., :3], turned[..., 3]
+    dh[..., 3:6] = (e @ A.transpose(0, 2, 1) @ -_SKEW).reshape(count, 4, 3, 3) @ R_CL[:, None]
+    dh[:, :, 0, 6] = -dh[:, :, 2, 7] * moments.right[:, None]  # -e_y x h
+    dh[:, :, 2, 6] = dh[:, :, 0, 7] * moments.right[:, None]
+    xy = dh[..., :2, 7]
+    dh /= np.sqrt((xy * xy).sum(-1))[..., None, None]
+    line = dh[..., 7].copy()
+    dh -= line[..., None] * (line[..., None, :2] @ dh[..., :2, :])
+    dh[..., 7] = line
+    out = (moments.B @ dh.reshape(count, 12, 8)).reshape(-1, 8)
+    return out[:, 7], out[:, :7]
 
 
 def _refine(
@@ -438,7 +454,9 @@ def _refine(
         if n == 7:
             H[6, 6] += prior[6]
             g[6] += prior[6] * yaw
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12), -g)
+        damped = H.copy()
+        damped.flat[:: n + 1] += damping * (H.diagonal() + 1e-12)
+        step = np.linalg.solve(damped, -g)
         gain = -2 * (g @ step) - step @ H @ step  # the decrease that the linear model expects
         R_new, p_new = R @ frames.rotation(step[:3]), p + step[3:6]
         yaw_new = yaw + step[6] if n == 7 else yaw
@@ -762,7 +780,7 @@ def _paper(
 
 def _gate(views: list[_View], fit: _Fit, residual: float, config: RectangleEstimatorConfig) -> str:
     """Why a pose is not to be believed, or ""."""
-    distance = float(np.linalg.norm(fit.p))
+    distance = math.hypot(*fit.p)
     if not np.isfinite(distance) or fit.p[2] <= 0:
         return "behind the camera"
     # The closed form's own bias leaves residuals that say nothing about the edges.
@@ -770,13 +788,13 @@ def _gate(views: list[_View], fit: _Fit, residual: float, config: RectangleEstim
         return f"residual {residual:.2f} px"
     if not config.min_distance <= distance <= config.max_distance:
         return f"distance {distance:.2f} m"
-    tilt = math.acos(float(np.clip(fit.R[:, 2] @ fit.p / distance, -1, 1)))
+    tilt = math.acos(min(max(float(fit.R[:, 2] @ fit.p) / distance, -1.0), 1.0))
     if tilt > config.max_tilt:
         return f"tilt {math.degrees(tilt):.0f} deg"
     if len(views) == 2:
         ratio = _triangulated_distance(views) / distance
         # One pixel of disparity, widened by the corners' own error.
-        allowed = config.size_gate + distance / (views[1].focal * max(np.linalg.norm(views[1].X_CL[:, 3]), 1e-6))
+        allowed = config.size_gate + distance / (views[1].focal * max(math.hypot(*views[1].X_CL[:, 3]), 1e-6))
         if not abs(ratio - 1) < allowed:
             return f"size: {ratio:.2f} of the marker's"
     return ""
@@ -790,7 +808,9 @@ def _triangulated_distance(views: list[_View]) -> float:
         centre = _cross(_cross(c[0], c[2]), _cross(c[1], c[3]))
         rays.append(view.X_CL[:, :3].T @ (centre / centre[2]))
     p_LR = -views[1].X_CL[:, :3].T @ views[1].X_CL[:, 3]
-    s = np.linalg.lstsq(np.column_stack([rays[0], -rays[1]]), p_LR, rcond=None)[0][0]
+    a, b = rays
+    aa, ab, bb = a @ a, a @ b, b @ b
+    s = (bb * (a @ p_LR) - ab * (b @ p_LR)) / max(aa * bb - ab * ab, 1e-300)
     return float(s * np.linalg.norm(rays[0]))
 
 

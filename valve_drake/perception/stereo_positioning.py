@@ -18,6 +18,9 @@ from valve_drake.messages import MarkerCandidate, SegmentationPair, StereoPositi
 from valve_drake.perception.color_segmentation import middle
 from valve_drake.perception.marker import NEXT, Marker
 
+_CORNER = np.arange(4)
+_TURNED = (_CORNER[:, None] + _CORNER) % 4
+
 
 @dc.dataclass
 class StereoPositioningConfig:
@@ -151,9 +154,7 @@ def wrong_size(
     corners' errors in depth do not lengthen them) must have the marker's lengths. One camera cannot tell a long box
     from the marker seen at a slant, two can.
     """
-    a, b = left - left.mean(0), right - right.mean(0)
-    turn = min(range(4), key=lambda k: float(((a - np.roll(b, -k, axis=0)) ** 2).sum()))
-    P, _ = _mid_points(left, np.roll(right, -turn, axis=0), head)
+    P, _ = _mid_points(left, np.roll(right, -turn_between(left, right), axis=0), head)
     sides = P[NEXT] - P
     lengths = np.linalg.norm(sides[:2] - sides[2:], axis=1) / 2
     baseline = max(float(np.linalg.norm(head.X_LR[:, 3])), 1e-9)
@@ -165,14 +166,22 @@ def wrong_size(
     return ""
 
 
+def turn_between(left: np.ndarray, right: np.ndarray) -> int:
+    """How many corners the right quadrilateral's first one (4, 2) lies behind the left one's: 0..3."""
+    # Of the squared distances of all corners only the products depend on the turn.
+    products = (left - left.sum(0) / 4) @ (right - right.sum(0) / 4).T
+    return int(np.argmax(products[_CORNER, _TURNED].sum(1)))
+
+
 def _mid_points(left: np.ndarray, right: np.ndarray, head: StereoHead) -> tuple[np.ndarray, np.ndarray]:
     """Where the rays of ideal points (n, 2) come nearest, (n, 3) in L, and the gap between them (n,) [m].
 
     NaN for parallel rays.
     """
-    one = np.ones((len(left), 1))
     t = head.X_LR[:, 3]
-    a, b = np.hstack([left, one]), np.hstack([right, one]) @ head.X_LR[:, :3].T
+    a, b = np.ones((2, len(left), 3))
+    a[:, :2], b[:, :2] = left, right
+    b = b @ head.X_LR[:, :3].T
     aa, ab, bb, ta, tb = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1), a @ t, b @ t
     det = aa * bb - ab * ab
     det = np.where(det < 1e-12 * aa * bb, np.nan, det)
