@@ -18,7 +18,7 @@ slow: $(READY)
 # Other people's readers on a log (LOG=FILE, else on a run made for it); those that cannot be installed are skipped.
 readers: $(READY)
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[readers]'
-	-npm install --silent --no-audit --no-fund --no-package-lock --prefix tests/readers
+	-npm install --fetch-retries=0 --silent --no-audit --no-fund --no-package-lock --prefix tests/readers
 	LOG=$(LOG) $(BIN)/python -m pytest -m readers -rs
 
 draw: $(READY)

@@ -15,6 +15,7 @@ from valve_drake.analysis import plots, report, two_logs
 from valve_drake.analysis.curves import make_plots
 from valve_drake.analysis.pictures import Album
 from valve_drake.messages import ModeState
+from valve_drake.pace import PACE, Pace
 from valve_drake.recording.writer import LogWriter
 
 BROWSER = next(
@@ -181,6 +182,17 @@ def test_a_log_without_modes_or_of_another_program_has_its_page(tmp_path):
     page = report.page(report.review(tmp_path / "bare.mcap"), tmp_path)
     check_markup(page)
     assert "no <code>/supervisor/mode" in page and "/rectangle_estimator/estimate" in page
+
+
+def test_the_page_says_how_real_time_was_kept(tmp_path):
+    with LogWriter(tmp_path / "paced.mcap") as writer:
+        for k in (1, 2):
+            writer.write(PACE, Pace(time=k, ticks=128 * k, missed=3 * k, median=0.002, p99=0.0071, longest=0.030), k)
+    found = report.review(tmp_path / "paced.mcap")
+    page = report.page(found, tmp_path)
+    check_markup(page)
+    assert "6 of 256" in page and "p99 7.1" in page
+    assert report.facts(found)["pace"]["p99_ms"] == pytest.approx(7.1)
 
 
 def test_without_truth_the_position_wanders_about_its_median_within_its_band(tmp_path):

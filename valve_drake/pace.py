@@ -15,6 +15,9 @@ from valve_drake.messages import Message
 from valve_drake.ports import TICK
 
 
+PACE = "/pace"  # its topic
+
+
 @dc.dataclass(frozen=True, eq=False)
 class Pace(Message):
     """How a paced loop has kept its time since its beginning; logged as /pace every second.

@@ -27,7 +27,7 @@ from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError, require
 from valve_drake.diagram import System, command, make_diagram
 from valve_drake.messages import Mode, ModeState, OperatorCommand
-from valve_drake.pace import Pace, Pacer
+from valve_drake.pace import PACE, Pace, Pacer
 from valve_drake.ports import SLOT, TICK, profile
 from valve_drake.recording import layout
 from valve_drake.recording.container import active
@@ -256,7 +256,7 @@ def _in_real_time(simulator: Simulator, pacer: Pacer, sink: Sink) -> Callable[[f
             pacer.tick(lambda end=tick + 3 * SLOT: simulator.AdvanceTo(end))
             now = context.get_time()
             if int(tick) != int(tick + TICK):
-                sink.write("/pace", pacer.report(now), now)
+                sink.write(PACE, pacer.report(now), now)
             if now + TICK > until + SLOT:
                 return
 

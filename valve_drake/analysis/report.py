@@ -25,6 +25,7 @@ from valve_drake.analysis.pictures import Album, Moment
 from valve_drake.analysis.plots import LEFT, RIGHT, WIDTH, nice_ticks
 from valve_drake.analysis.traces import ModeSpan, Traces
 from valve_drake.messages import Mode
+from valve_drake.pace import PACE, Pace
 from valve_drake.recording.reader import LogReader
 
 AT_REST = (Mode.MEASURE, Mode.VERIFY)
@@ -44,6 +45,7 @@ class Review:
     scenario_text: str
     scenario: dict[str, Any]
     recording: Path | None  # the 3D recording beside the log
+    pace: Pace | None  # how real time was kept, of a paced run
 
     @property
     def name(self) -> str:
@@ -66,7 +68,16 @@ def review(path: str | os.PathLike) -> Review:
         text,
         _parsed(text),
         recording if recording.is_file() else None,
+        _pace(log),
     )
+
+
+def _pace(log: LogReader) -> Pace | None:
+    """The last that the log says of it: it counts from the beginning."""
+    last = None
+    for _, _, message in log.messages([PACE] if PACE in log.topics else []):
+        last = message
+    return last
 
 
 def facts(found: Review) -> dict[str, Any]:
@@ -93,6 +104,7 @@ def facts(found: Review) -> dict[str, Any]:
         "mode_durations_s": found.summary.mode_durations(),
         "topics": topics,
         "recording": str(found.recording) if found.recording else None,
+        "pace": found.pace and found.pace.as_json(),
         "run": found.run,
         "scenario": found.scenario,
     }
@@ -208,7 +220,7 @@ def page(found: Review, beside: Path) -> str:
             r=found,
             s=found.summary,
             integrity=found.integrity,
-            tiles=tiles(found.summary),
+            tiles=tiles(found.summary, found.pace),
             timeline=timeline(spans, start, end, found.integrity.gaps()),
             plots=[(plot, plot.svg(spans, start, end)) for plot in plots],
             missing=found.traces.missing,
@@ -310,7 +322,7 @@ def _bar_text(x: float, width: float, middle: float, text: str) -> str:
     return f'<text class="time before" x="{x - 6:.1f}" y="{middle + 4}">{text}</text>'
 
 
-def tiles(s: Summary) -> list[tuple[str, str, str]]:
+def tiles(s: Summary, pace: Pace | None = None) -> list[tuple[str, str, str]]:
     """(label, value, remark) of the numbers to see first."""
     out: list[tuple[str, str, str]] = []
 
@@ -349,6 +361,9 @@ def tiles(s: Summary) -> list[tuple[str, str, str]]:
     if s.servo_final_error_m:
         worst = max(s.servo_final_error_m.values())
         add("hands before the grasp", worst, lambda v: f"{1e3 * v:.2f} mm", "worse hand, by its own image")
+    if pace is not None:
+        times = f"median {1e3 * pace.median:.1f}, p99 {1e3 * pace.p99:.1f}, longest {1e3 * pace.longest:.0f} ms"
+        add("late ticks", pace.missed, lambda v: f"{v} of {pace.ticks}", times)
     return out
 
 
