@@ -51,7 +51,7 @@ AT_VALVE = (Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE)  # the 
 class HybridRotationConfig:
     """Scenario key `hybrid_rotation`."""
 
-    damping: float = 4000.0  # D, of each hand: stable with 30 ms of delay on the way to the robot [N s/m]
+    damping: float = 4000.0  # D, of each hand: stable on a wire that is 20 ms late each way [N s/m]
     angular_damping: float = 256.0  # [N m s/rad]
     filter: float = 10.0  # low-pass of the wrenches [Hz]
     rate: float = 0.105  # of the turn [rad/s]
