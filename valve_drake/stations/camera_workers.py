@@ -8,6 +8,7 @@ capture. So it is begun when it is captured, if it will be looked at, and is fet
 import collections
 import dataclasses as dc
 import multiprocessing.connection
+import os
 import signal
 import socket
 import subprocess
@@ -117,6 +118,7 @@ class CameraWorkers:
 def serve(fd: int) -> None:
     """The other process: builds the rig, makes what it is asked for, ends when nobody is left to ask."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides when it ends
+    os.nice(5)  # the run goes first where processors are few
     cv2.setNumThreads(1)
     wire = multiprocessing.connection.Connection(fd)
     try:
