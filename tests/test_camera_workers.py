@@ -1,7 +1,5 @@
 """camera_workers: the same images as the rig's, made in other processes and begun ahead."""
 
-import gc
-
 import numpy as np
 import pytest
 
@@ -73,12 +71,14 @@ def test_a_simulation_begun_anew_gets_its_own_images(rig, workers):
     assert anew.data == rig.frame("left_wrist", second).data
 
 
-def test_the_processes_end_with_the_block_and_a_lost_one_is_named(rig, rig_arguments):
+@pytest.mark.parametrize("gone", [True, False])
+def test_the_processes_end_with_the_block_and_a_lost_one_is_named(rig, rig_arguments, gone):
     with CameraWorkers() as workers:
         workers.start(*rig_arguments)
         processes = [worker.process for worker in workers._workers]
         processes[0].kill()
+        if gone:  # before it is asked, else while it is
+            processes[0].wait()
         with pytest.raises(RuntimeError, match="renders head_left ended with code -9"):
             workers.frame("head_left", captures(rig, 1)[0])
     assert all(process.poll() is not None for process in processes)
-    gc.collect()

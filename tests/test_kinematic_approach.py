@@ -197,7 +197,7 @@ def test_the_stance_is_the_best_place_for_what_is_seen(base):
 def test_the_stance_is_renewed_from_the_latest_looks():
     bench = Bench(np.array([0.1, -0.2, 0.1]))
     seen = []
-    bench.run(Mode.FINE_APPROACH, limit=3.4 * CONFIG.stance_period, each=lambda b: seen.append(b.memory.stance))
+    bench.run(Mode.FINE_APPROACH, limit=3 * CONFIG.stance_period + 0.2, each=lambda b: seen.append(b.memory.stance))
     times = sorted({s.time for s in seen if s.found})
     assert np.diff(times) == pytest.approx([CONFIG.stance_period] * 3, abs=1.1 * IMAGE * TICK)
     bench.X_OV = make(X_OV[:, :3], X_OV[:, 3] + [0.10, 0, 0])  # the odometry has slipped

@@ -6,6 +6,7 @@ capture. So it is begun when it is captured, if it will be looked at, and is fet
 """
 
 import collections
+import contextlib
 import dataclasses as dc
 import multiprocessing.connection
 import os
@@ -14,6 +15,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -81,11 +83,8 @@ class CameraWorkers:
                 self._ask(CAMERAS[k], other)
         while (name, capture.sequence) not in self._made:
             self._receive(name)
-        last, _ = self._read.get(name, (capture.sequence, 0))
-        if capture.sequence != last:
-            self._read[name] = (capture.sequence, max(capture.sequence - last, 0))
-        else:
-            self._read.setdefault(name, (capture.sequence, 0))
+        last, stride = self._read.get(name, (capture.sequence, 0))
+        self._read[name] = (capture.sequence, capture.sequence - last if capture.sequence > last else stride)
         frame = self._made[name, capture.sequence]
         for sequence in [s for s in self._asked[name] if s < capture.sequence and (name, s) in self._made]:
             del self._asked[name][sequence], self._made[name, sequence]
@@ -100,19 +99,23 @@ class CameraWorkers:
                 self._receive(name)
             del self._made[name, capture.sequence]
         self._asked[name][capture.sequence] = capture
-        self._worker(name).wire.send((name, capture))
-
-    def _worker(self, name: str) -> _Worker:
-        return self._workers[CAMERAS.index(name) % WORKERS]
+        with self._wire(name) as wire:
+            wire.send((name, capture))
 
     def _receive(self, name: str) -> None:
-        worker = self._worker(name)
-        try:
-            frame, seconds = worker.wire.recv()
-        except (EOFError, OSError) as error:
-            raise RuntimeError(f"the process that renders {name} ended with code {worker.process.wait()}") from error
+        with self._wire(name) as wire:
+            frame, seconds = wire.recv()
         profile.beside += seconds
         self._made[frame.camera, frame.sequence] = frame
+
+    @contextlib.contextmanager
+    def _wire(self, name: str) -> Iterator[multiprocessing.connection.Connection]:
+        """The wire to the process that makes this camera's images; names it if it has ended."""
+        worker = self._workers[CAMERAS.index(name) % WORKERS]
+        try:
+            yield worker.wire
+        except (EOFError, OSError) as error:
+            raise RuntimeError(f"the process that renders {name} ended with code {worker.process.wait()}") from error
 
 
 def serve(fd: int) -> None:
