@@ -16,11 +16,12 @@ from valve_drake.ports import SLOT, TICK
 from valve_drake.stations import lcm_channels
 from valve_drake.stations.camera_rig import encode_frame
 from valve_drake.stations.contract import CAMERAS, CONTRACT, check_contract
-from valve_drake.stations.hardware import DEVICES, SPEEDS, RobotLink, make_hardware_station
+from valve_drake.stations.hardware import SPEEDS, RobotLink, make_hardware_station
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
     CONTROLLER,
+    DEVICES,
     REPORTS,
     REQUEST,
     STATE,
@@ -235,10 +236,12 @@ def test_the_station_waits_for_its_robot_when_it_is_initialised_and_then_shows_w
     simulator = Simulator(make_hardware_station(puppet.link))
     with pytest.raises(OperationFailed, match="does not answer"):
         simulator.Initialize()
+    station, context = simulator.get_system(), simulator.get_context()
+    for port in OUT:
+        assert np.all(np.isnan(station.GetOutputPort(port).Eval(context))), "what is not known is not zero"
     said = values(5)
     puppet.report(said)
     simulator.Initialize()
-    station, context = simulator.get_system(), simulator.get_context()
     for port in OUT:
         np.testing.assert_allclose(station.GetOutputPort(port).Eval(context), said[port], rtol=1e-15)
 

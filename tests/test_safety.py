@@ -138,6 +138,8 @@ class Rehearsal:
             vars(thing).update(values)
         self.link.bus.sent, self.twin._bus.sent = sent
         self.faults([])
+        for wire in (self.twin._in, self.twin._out):  # what a slow wire still held belongs to the branch that was left
+            wire._waiting.clear()
         self.motion.clear()
 
     def faults(self, faults):

@@ -6,9 +6,11 @@ import os
 import shutil
 import subprocess
 import sys
+import time as wall
 
 import numpy as np
 import pytest
+from pydrake.lcm import DrakeLcm
 
 from valve_drake import rehearsal, runner
 from valve_drake import scenario as scenarios
@@ -17,9 +19,9 @@ from valve_drake.messages import Mode
 from valve_drake.pace import Pacer
 from valve_drake.ports import TICK
 from valve_drake.recording.reader import LogReader
-from valve_drake.stations.contract import CONTRACT
+from valve_drake.stations.contract import CAMERAS, CONTRACT
 from valve_drake.stations.faults import FaultConfig, Faults, Wire
-from valve_drake.stations.lcm_channels import COMMANDS, REPORTS
+from valve_drake.stations.lcm_channels import COMMANDS, CONTROLLER, LOCKSTEP_TIME, REPORTS, REQUEST, ROBOT, SYNC, Bus
 from valve_drake.stations.twin import Guard
 
 ARM = "left_arm.position_command"
@@ -255,6 +257,45 @@ def test_the_same_seed_gives_the_same_log_to_the_byte(short, tmp_path):
     assert (tmp_path / "again.mcap").read_bytes() == path.read_bytes()
 
 
+def test_a_twin_that_lives_by_the_clock_sends_the_images_that_are_asked_for_and_no_others():
+    scenario = scenarios.resolve(near("hardware.lockstep=false"))
+    lcm, seen = DrakeLcm("memq://"), []
+    bus = Bus(scenario.hardware, lcm)
+    bus.listen(ROBOT, lambda key, message: seen.append(message.images[0].header) if key.endswith(".image") else None)
+    with rehearsal.LiveImages() as images:
+        twin = rehearsal.make_twin(scenario, workers=images, lcm=lcm)
+        begin = wall.monotonic()
+        while len(seen) < 2:
+            assert wall.monotonic() - begin < 60
+            bus.say(REQUEST, 0, {camera: camera == "left_wrist" for camera in CAMERAS})
+            twin.hear()
+            twin.report()
+            twin.move()
+            while bus.pump():
+                pass
+    assert {header.frame_name for header in seen} == {"left_wrist"}
+    assert 0 < seen[0].seq < seen[1].seq and seen[0].utime > 0
+
+
+def test_in_lock_step_the_twin_ends_when_the_program_has_fallen_silent(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("valve_drake.stations.twin.wall.monotonic", lambda: clock[0])
+    scenario = scenarios.resolve(near())
+    lcm = DrakeLcm("memq://")
+    twin = rehearsal.make_twin(scenario, lcm=lcm)
+    clock[0] = 1000.0
+    twin.poll()
+    assert not twin.gone, "it waits for a program as long as it takes"
+    Bus(scenario.hardware, lcm).say(SYNC[CONTROLLER], 0, {"tick": -1, "messages": 0})
+    twin.poll()
+    clock[0] += LOCKSTEP_TIME
+    twin.poll()
+    assert not twin.gone
+    clock[0] += 1.0
+    twin.poll()
+    assert twin.gone
+
+
 def test_a_hardware_log_replays_to_the_bit(short):
     result = runner.replay(LogReader(short[1]))
     assert result.comparison.identical, result.comparison.first
@@ -277,7 +318,7 @@ def two_processes(folder, run, twin, common=()):
     """Both commands in a network namespace of their own, so that nothing leaves the machine -> (run, twin) JSON."""
     (folder / "both.sh").write_text(
         'python=$1; "$python" -m valve_drake twin $TWIN $COMMON --json > twin.json & '
-        '"$python" -m valve_drake run hardware.scenario.yaml $RUN $COMMON --log run.mcap --json > run.json; '
+        '"$python" -m valve_drake run hardware.scenario.yaml $RUN $COMMON --log run.mcap --json > program.json; '
         "code=$?; wait $!; exit $code\n"
     )
     words = {"RUN": " ".join(run), "TWIN": " ".join(twin), "COMMON": " ".join(common)}
@@ -285,7 +326,7 @@ def two_processes(folder, run, twin, common=()):
         [*SPACE, "sh", "both.sh", sys.executable], cwd=folder, env=os.environ | words, capture_output=True, text=True
     )
     assert "Traceback" not in done.stderr, done.stderr
-    return done, [json.loads((folder / f"{name}.json").read_text()) for name in ("run", "twin")]
+    return done, [json.loads((folder / f"{name}.json").read_text()) for name in ("program", "twin")]
 
 
 needs_space = pytest.mark.skipif(bool(_space()), reason=_space() or "-")

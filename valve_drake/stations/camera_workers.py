@@ -108,10 +108,13 @@ class CameraWorkers:
         profile.beside += seconds
         self._made[frame.camera, frame.sequence] = frame
 
+    def _worker(self, name: str) -> _Worker:
+        return self._workers[CAMERAS.index(name) % WORKERS]
+
     @contextlib.contextmanager
     def _wire(self, name: str) -> Iterator[multiprocessing.connection.Connection]:
         """The wire to the process that makes this camera's images; names it if it has ended."""
-        worker = self._workers[CAMERAS.index(name) % WORKERS]
+        worker = self._worker(name)
         try:
             yield worker.wire
         except (EOFError, OSError) as error:

@@ -17,7 +17,6 @@ A fault begins `start` seconds after the run's beginning, or after `mode` was fi
 (0: to the end). What chance decides is drawn from the seed.
 """
 
-import collections
 import dataclasses as dc
 import math
 import zlib
@@ -29,13 +28,10 @@ import numpy as np
 from valve_drake.checks import require, require_in
 from valve_drake.messages import Mode
 from valve_drake.ports import TICK
-from valve_drake.stations.contract import CAMERAS
-from valve_drake.stations.lcm_channels import CHANNELS, REPORTS
+from valve_drake.stations.lcm_channels import CHANNELS, DEVICES, JOINTS
 
 WIRE = ("latency", "loss", "duplicate", "reorder")
 DEVICE = ("frozen", "nan", "dead", "restart", "stuck", "estop")
-DEVICES = (*(row.device for row in REPORTS), *CAMERAS, "robot")
-JOINTS = {"torso": 3, "left_arm": 6, "right_arm": 6}
 
 
 @dc.dataclass
@@ -139,7 +135,7 @@ class Wire:
         self._faults = faults
         self._deliver = deliver
         self._newest_only = newest_only
-        self._waiting: collections.deque[tuple[float, str, Any]] = collections.deque()
+        self._waiting: list[tuple[float, str, Any]] = []
 
     def put(self, key: str, message: Any, time: float) -> None:
         for when in self._faults.arrivals(CHANNELS[key].device, time):
@@ -148,7 +144,7 @@ class Wire:
     def pass_on(self, time: float) -> None:
         """Delivers what is due, first due first."""
         due = sorted((item for item in self._waiting if item[0] <= time), key=lambda item: item[0])
-        self._waiting = collections.deque(item for item in self._waiting if item[0] > time)
+        self._waiting = [item for item in self._waiting if item[0] > time]
         if self._newest_only:
             due = list({key: (when, key, message) for when, key, message in due}.values())
         for _, key, message in due:

@@ -35,7 +35,10 @@ from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
     CONTROLLER,
+    DEVICES,
     IMAGES,
+    JOINTS,
+    LOCKSTEP_TIME,
     MODE,
     PROTOCOL,
     REPORTS,
@@ -51,8 +54,6 @@ from valve_drake.stations.lcm_channels import (
     to_utime,
 )
 
-JOINTS = {"torso": 3, "left_arm": 6, "right_arm": 6}
-DEVICES = (*(row.device for row in REPORTS), *CAMERAS, "robot")
 NEVER_STILL = tuple(row.key for row in REPORTS if row.device.endswith("wrist_sensor"))
 SPEEDS = ("base.odometry", *(f"{side}_arm.velocity_measured" for side in SIDES))  # ports that tell of motion
 MOVING = 0.005  # [rad/s, m/s]
@@ -61,7 +62,6 @@ LOOKED_AT = 0.75  # after the last look at a camera it is requested for this lon
 DELAYS = 2.0  # the least delay is taken over this long [s]
 RESTART = 0.5  # a stamp that goes back by more is a driver begun anew; it is reported for as long [s]
 DECODING = 5e-3  # that an image takes, with room [s]
-LOCKSTEP_TIME = 60.0  # lock-step: how long the robot may think about one tick [s, wall]
 HEALTH_TICKS = 4  # health is reported every 1/32 s
 
 
@@ -99,6 +99,13 @@ class Snapshot:
 
     def __deepcopy__(self, memo: dict) -> "Snapshot":
         return self
+
+
+BEFORE = Snapshot(  # the station was initialised
+    {s.name: np.full(s.kind, np.nan) for s in CONTRACT if s.direction == "out" and isinstance(s.kind, int)},
+    dict.fromkeys(CAMERAS),
+    Health(),
+)
 
 
 class RobotLink:
@@ -380,7 +387,7 @@ class LcmReceiver(LeafSystem):
         super().__init__()
         self.set_name("lcm_receiver")
         self._link = link
-        self._snapshot = self.DeclareAbstractState(Value(_Shown()))
+        self._snapshot = self.DeclareAbstractState(Value(BEFORE))
         self.DeclareInitializationUnrestrictedUpdateEvent(lambda context, state: self._keep(state, link.start()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             TICK, 3 * SLOT, lambda context, state: self._keep(state, link.update(context.get_time()))
@@ -397,36 +404,22 @@ class LcmReceiver(LeafSystem):
                 self.DeclareAbstractOutputPort(spec.name, functools.partial(Value, spec.kind()), calc, when)
 
     def _keep(self, state: State, snapshot: Snapshot) -> None:
-        state.get_mutable_abstract_state().get_mutable_value(int(self._snapshot)).set_value(_Shown(snapshot))
+        state.get_mutable_abstract_state().get_mutable_value(int(self._snapshot)).set_value(snapshot)
 
-    def _shown(self, context: Context) -> Snapshot | None:
-        return context.get_abstract_state(int(self._snapshot)).get_value().snapshot
+    def _shown(self, context: Context) -> Snapshot:
+        return context.get_abstract_state(int(self._snapshot)).get_value()
 
     def _calc_vector(self, name: str, context: Context, output: BasicVector) -> None:
-        shown = self._shown(context)
-        output.SetFromVector(np.full(output.size(), np.nan) if shown is None else shown.values[name])
+        output.SetFromVector(self._shown(context).values[name])
 
     def _calc_health(self, context: Context, output: Value) -> None:
-        shown = self._shown(context)
-        output.set_value(Health() if shown is None else shown.health)
+        output.set_value(self._shown(context).health)
 
     def _calc_image(self, camera: str) -> Callable[[Context, Value], None]:
         def calc(context: Context, output: Value) -> None:
-            shown = self._shown(context)
-            image = None if shown is None else shown.images[camera]
-            output.set_value(self._link.look(camera, image, context.get_time()))
+            output.set_value(self._link.look(camera, self._shown(context).images[camera], context.get_time()))
 
         return calc
-
-
-@dc.dataclass(frozen=True)
-class _Shown:
-    """The receiver's state; None before it was initialised."""
-
-    snapshot: Snapshot | None = None
-
-    def __deepcopy__(self, memo: dict) -> "_Shown":
-        return self
 
 
 class LcmSender(LeafSystem):

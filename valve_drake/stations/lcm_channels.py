@@ -31,6 +31,8 @@ PROTOCOL = 1  # version of this table; a robot that speaks another one is refuse
 ROBOT, CONTROLLER = "robot", "controller"  # who sends
 MODE, REQUEST, STATE = "controller.mode", "cameras.request", "robot.state"
 SYNC = {ROBOT: "robot.sync", CONTROLLER: "controller.sync"}
+JOINTS = {"torso": 3, "left_arm": 6, "right_arm": 6}  # of a device: how many
+LOCKSTEP_TIME = 60.0  # lock-step: how long either side may think about one tick [s, wall]
 MM = 1e3  # Drake's gripper messages are in mm
 
 Values = dict[str, np.ndarray]  # port of the contract -> its vector
@@ -125,30 +127,17 @@ def _joint_status(position: str, n: int, velocity: str = "", torque: str = "") -
     return write, read
 
 
-def _gripper_command(side: str) -> tuple[Callable, Callable]:
-    position, force = f"{side}_gripper.position_command", f"{side}_gripper.force_limit"
+def _gripper(kind: type, position: str, force: str, fields: tuple[str, str]) -> tuple[Callable, Callable]:
+    opening, newton = fields
 
-    def write(values: Values) -> lcmt_schunk_wsg_command:
-        message = lcmt_schunk_wsg_command()
-        message.target_position_mm, message.force = MM * float(values[position][0]), float(values[force][0])
+    def write(values: Values) -> Any:
+        message = kind()
+        setattr(message, opening, MM * float(values[position][0]))
+        setattr(message, newton, float(values[force][0]))
         return message
 
-    def read(message: lcmt_schunk_wsg_command) -> Values:
-        return {position: np.array([message.target_position_mm / MM]), force: np.array([message.force])}
-
-    return write, read
-
-
-def _gripper_status(side: str) -> tuple[Callable, Callable]:
-    position, force = f"{side}_gripper.position_measured", f"{side}_gripper.force_measured"
-
-    def write(values: Values) -> lcmt_schunk_wsg_status:
-        message = lcmt_schunk_wsg_status()
-        message.actual_position_mm, message.actual_force = MM * float(values[position][0]), float(values[force][0])
-        return message
-
-    def read(message: lcmt_schunk_wsg_status) -> Values:
-        return {position: np.array([message.actual_position_mm / MM]), force: np.array([message.actual_force])}
+    def read(message: Any) -> Values:
+        return {position: np.array([getattr(message, opening) / MM]), force: np.array([getattr(message, newton)])}
 
     return write, read
 
@@ -182,17 +171,20 @@ def _rows() -> Iterable[Channel]:
     turns = "waist and neck_yaw to the left, neck_pitch downwards"
     yield Channel(
         "torso.command", CONTROLLER, lcmt_iiwa_command, TICKS, f"waist, neck_pitch, neck_yaw: {joints}; {turns}",
-        *_joint_command("torso.position_command", 3),
+        *_joint_command("torso.position_command", JOINTS["torso"]),
     )  # fmt: skip
     for side in SIDES:
         yield Channel(
             f"{side}_arm.command", CONTROLLER, lcmt_iiwa_command, TICKS, f"6 joints, shoulder to wrist: {joints}",
-            *_joint_command(f"{side}_arm.position_command", 6),
+            *_joint_command(f"{side}_arm.position_command", JOINTS[f"{side}_arm"]),
         )  # fmt: skip
         yield Channel(
             f"{side}_gripper.command", CONTROLLER, lcmt_schunk_wsg_command, TICKS,
             "target_position_mm: opening between the pads [mm]; force: limit of the finger actuator, above 0 [N]",
-            *_gripper_command(side),
+            *_gripper(
+                lcmt_schunk_wsg_command, f"{side}_gripper.position_command", f"{side}_gripper.force_limit",
+                ("target_position_mm", "force"),
+            ),
         )  # fmt: skip
     yield Channel(
         "base.status", ROBOT, lcmt_drake_signal, TICKS,
@@ -202,18 +194,23 @@ def _rows() -> Iterable[Channel]:
     yield Channel(
         "torso.status", ROBOT, lcmt_iiwa_status, TICKS,
         f"waist, neck_pitch, neck_yaw: joint_position_measured [rad], signs as commanded; {_UNUSED}",
-        *_joint_status("torso.position_measured", 3),
+        *_joint_status("torso.position_measured", JOINTS["torso"]),
     )  # fmt: skip
     for side in SIDES:
-        arm = f"{side}_arm."
+        arm, gripper = f"{side}_arm", f"{side}_gripper"
         yield Channel(
-            f"{side}_arm.status", ROBOT, lcmt_iiwa_status, TICKS, f"6 joints: {_ARM}; {_UNUSED}",
-            *_joint_status(arm + "position_measured", 6, arm + "velocity_measured", arm + "torque_measured"),
+            f"{arm}.status", ROBOT, lcmt_iiwa_status, TICKS, f"6 joints: {_ARM}; {_UNUSED}",
+            *_joint_status(
+                f"{arm}.position_measured", JOINTS[arm], f"{arm}.velocity_measured", f"{arm}.torque_measured"
+            ),
         )  # fmt: skip
         yield Channel(
-            f"{side}_gripper.status", ROBOT, lcmt_schunk_wsg_status, TICKS,
+            f"{gripper}.status", ROBOT, lcmt_schunk_wsg_status, TICKS,
             f"actual_position_mm: opening [mm]; actual_force: on the pads, positive closes [N]; {_UNUSED}",
-            *_gripper_status(side),
+            *_gripper(
+                lcmt_schunk_wsg_status, f"{gripper}.position_measured", f"{gripper}.force_measured",
+                ("actual_position_mm", "actual_force"),
+            ),
         )  # fmt: skip
         yield Channel(
             f"{side}_wrist_sensor.status", ROBOT, lcmt_force_torque, TICKS,
@@ -252,6 +249,7 @@ CHANNELS: dict[str, Channel] = {row.key: row for row in _rows()}
 COMMANDS = tuple(row for row in CHANNELS.values() if row.sender == CONTROLLER and row.write)
 REPORTS = tuple(row for row in CHANNELS.values() if row.sender == ROBOT and row.write)
 IMAGES = {camera: CHANNELS[f"{camera}.image"] for camera in CAMERAS}
+DEVICES = (*(row.device for row in REPORTS), *CAMERAS, "robot")
 
 
 def table() -> str:
@@ -359,9 +357,9 @@ class Bus:
         message.timestamp = utime
         self.send(key, message)
 
-    def pump(self, wait: float = 0.0) -> bool:
-        """Hands out what has arrived; waits up to `wait` seconds for something -> whether there was any."""
-        return self.lcm.HandleSubscriptions(int(1e3 * wait)) > 0
+    def pump(self) -> bool:
+        """Hands out what has arrived -> whether there was any."""
+        return self.lcm.HandleSubscriptions(0) > 0
 
     def name(self, key: str) -> str:
         return self._names[key]

@@ -7,11 +7,11 @@ What a robot's own side does, whatever the program asks:
 - a command that is not finite or absurd is refused, and counts as none;
 - the emergency stop stops base and joints and leaves the fingers to their commands, so that a hand can be opened.
 
-Both are reported as faults. The twin's time is its own: paced by the wall's clock, or in lock-step with the program.
+The first two are reported as faults, the stop as such. The twin's time is its own: paced by the wall's clock, or in
+lock-step with the program.
 """
 
 import math
-import os
 import time as wall
 from collections.abc import Mapping
 from typing import Any
@@ -27,12 +27,14 @@ from valve_drake.ports import SLOT, TICK
 from valve_drake.stations.camera_rig import Capture
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, CONTRACT
-from valve_drake.stations.faults import JOINTS, Faults, Wire
+from valve_drake.stations.faults import Faults, Wire
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
     CONTROLLER,
     IMAGES,
+    JOINTS,
+    LOCKSTEP_TIME,
     MODE,
     PROTOCOL,
     REPORTS,
@@ -68,12 +70,6 @@ class LiveImages(CameraWorkers):
         super().__init__()
         self.wanted: set[str] = set()
 
-    def start(self, *rig: object) -> "LiveImages":
-        super().start(*rig)
-        for worker in self._workers:  # rather a late image than a late tick
-            os.setpriority(os.PRIO_PROCESS, worker.process.pid, os.getpriority(os.PRIO_PROCESS, 0) + 5)
-        return self
-
     def captured(self, name: str, capture: Capture) -> None:
         if capture.sequence == 0:  # the first image takes a renderer seconds, and nobody has asked for it
             self._ask(name, capture)
@@ -81,8 +77,9 @@ class LiveImages(CameraWorkers):
                 self._receive(name)
             del self._asked[name][0], self._made[name, 0]
             return
-        busy = sum(k not in self._made for k in ((name, s) for s in self._asked[name]))
-        if name in self.wanted and busy < 2:  # a camera that cannot keep up drops images
+        # A camera that cannot keep up drops images; the two of a pair drop the same ones.
+        mate = CAMERAS[CAMERAS.index(name) ^ 1]
+        if name in self.wanted and (capture.sequence in self._asked[mate] or not self._asked[name] | self._asked[mate]):
             self._ask(name, capture)
 
     def ready(self) -> list[CameraFrame]:
@@ -325,7 +322,7 @@ class Twin:
                 self._idle_at = wall.monotonic()
                 self.report()
                 self._bus.say(SYNC[ROBOT], 0, {"tick": -1, "messages": 0})
-        elif self._sync[0] == -2:
+        elif self._sync[0] == -2 or wall.monotonic() - self._heard_at > LOCKSTEP_TIME:
             self.gone = True
         elif self._sync == (self.tick, self._heard):
             self.move()
