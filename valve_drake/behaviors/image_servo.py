@@ -40,6 +40,8 @@ from valve_drake.messages import (
     Verdict,
 )
 
+PAST = 63  # earlier samples of a hand's way that are kept: images up to half a second old can be used
+
 
 @dc.dataclass
 class ImageServoConfig:
@@ -132,7 +134,7 @@ class ImageServo:
         p_now = self.geometry.arm_forward(q, side)[:, 3]
         short = hand.X_HG[:, 3] - p_now  # joints that stand off their command for ever must not keep the hand off
         short = short * min(1.0, self.config.sag / max(float(np.linalg.norm(short)), 1e-12))
-        hand = dc.replace(hand, past=(*hand.past[-31:], (time, p_now + short)))
+        hand = dc.replace(hand, past=(*hand.past[-PAST:], (time, p_now + short)))
         if mark.found and mark.sequence != hand.seen and mark.time >= hand.past[0][0]:
             e = self.taught[side].displacement(mark.feature)
             R = hand.X_HG[:, :3]
