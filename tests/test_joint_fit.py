@@ -5,7 +5,7 @@ import pytest
 
 from valve_drake import frames
 from valve_drake.analysis import experiments
-from valve_drake.analysis.drawn_images import PLATE, Canvas, draw_board
+from valve_drake.analysis.drawn_images import PLATE, RED, Canvas, draw_board
 from valve_drake.perception import joint_fit as mut
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads, side_lines
 from valve_drake.perception.marker import NEXT, Marker
@@ -17,8 +17,8 @@ def pose(z, tilt=0.5, roll=0.3):
     return experiments._tilted(np.array([0.02, 0.01, z]), tilt, 0.7, roll)
 
 
-def canvas(X, blur=0.7):
-    out = Canvas(EYE, blur)
+def canvas(X):
+    out = Canvas(EYE)
     draw_board(out, X, MARKER)
     return out
 
@@ -81,12 +81,23 @@ def test_light_that_differs_from_side_to_side_keeps_the_sides_apart():
     assert quad.reason == "" and quad.information is None
 
 
-def test_a_corner_that_is_worn_off_is_not_used():
-    X, rng = pose(1.0), np.random.default_rng(2)
+@pytest.mark.parametrize("wear", [1.0, 0.04])  # pixels that are not the marker's; or each a little off
+def test_a_corner_that_is_worn_off_is_not_used(wear, monkeypatch):
+    X, rng, used, look = pose(1.0), np.random.default_rng(2), [], mut._corner_pixels
+
+    def spy(channel, curves, ends, planes, blur, frame, variance):
+        J, r = look(channel, curves, ends, planes, blur, frame, variance)
+        px = frame[0] + frame[1] * J[:, 1:3]
+        used.append(set(np.linalg.norm(px[:, None] - ends, axis=2).argmin(1).tolist()))
+        return J, r
+
+    monkeypatch.setattr(mut, "_corner_pixels", spy)
     whole, worn = canvas(X), canvas(X)
     chip = frames.make(frames.rot_z(np.pi / 4), np.array([0.049, 0.05, 0.0]))
-    worn.rectangle(frames.compose(X, chip), PLATE, (0.0018, 0.0018))
+    color = tuple(np.array(RED) + wear * np.subtract(PLATE, RED))
+    worn.rectangle(frames.compose(X, chip), color, (0.0025, 0.0025))
     good, bad = (fit(drawn.finish(rng, 2.0), X) for drawn in (whole, worn))
+    assert len(used[0]) == 4 and len(used[1]) == 3
     assert np.linalg.slogdet(bad.information)[1] < np.linalg.slogdet(good.information)[1]
     e = distances(bad, X)
     assert e @ bad.information @ e / 8 < 2.5
@@ -94,17 +105,21 @@ def test_a_corner_that_is_worn_off_is_not_used():
 
 def test_a_wedge_is_the_integral_of_the_blurred_corner():
     a, b = np.random.default_rng(0).uniform(-2.5, 2.5, (2, 40))
-    x = (np.arange(4000) + 0.5) / 4000 * 12 - 6
-    density = np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi) * 12 / 4000
-    for rho in (0.0, 0.3, -0.45):
+    node, share = np.polynomial.legendre.leggauss(40)
+
+    def exact(a, b, rho):
+        """P(X < a, Y < b): it grows with rho by the density at (a, b)."""
+        r = (node + 1) / 2 * rho
+        square = (a * a + b * b)[:, None] - 2 * r * (a * b)[:, None]
+        density = np.exp(-square / (2 * (1 - r * r))) / (2 * np.pi * np.sqrt(1 - r * r))
+        return mut.normal_cdf(a) * mut.normal_cdf(b) + density @ share * rho / 2
+
+    h = 1e-3
+    for rho in (0.0, 0.3, -0.49):
         cover, by_a, by_b = mut._wedge(a, b, np.full(40, rho))
-        # P(X < a, Y < b) = integral over x < a of P(Y < b | x)
-        given = mut.normal_cdf((b[:, None] - rho * x) / np.sqrt(1 - rho**2))
-        np.testing.assert_allclose(cover, ((x < a[:, None]) * given) @ density, atol=2.5e-3)
-        h = 1e-4
-        up, down = (mut._wedge(a + s * h, b, np.full(40, rho))[0] for s in (1, -1))
-        np.testing.assert_allclose(by_a, (up - down) / (2 * h), atol=1.2e-2)
-        np.testing.assert_allclose(by_b, mut._wedge(b, a, np.full(40, rho))[1], atol=1e-12)
+        np.testing.assert_allclose(cover, exact(a, b, rho), atol=1e-3)
+        np.testing.assert_allclose(by_a, (exact(a + h, b, rho) - exact(a - h, b, rho)) / (2 * h), atol=1e-4)
+        np.testing.assert_allclose(by_b, (exact(a, b + h, rho) - exact(a, b - h, rho)) / (2 * h), atol=1e-4)
 
 
 def test_jacobian_of_the_corner_pixels_equals_finite_differences():

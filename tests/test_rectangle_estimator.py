@@ -239,6 +239,16 @@ def test_points_are_not_believed_better_than_min_sigma_with_their_information_ei
     np.testing.assert_allclose(careful.covariance, 4 * plain.covariance, rtol=0.02)
 
 
+def test_cameras_that_are_not_as_calibrated_make_the_covariance_larger():
+    X = POSES[1]
+    edges = with_information(edge_points(X, HEAD, MARKER, 0.02, np.random.default_rng(0)))
+    turned = frames.compose(HEAD.X_LR, frames.make(frames.rot_x(0.0005), np.zeros(3)))  # half a pixel
+    right, wrong = (estimate(edges, head, MARKER, CONFIG, Track(X)) for head in (HEAD, dc.replace(HEAD, X_LR=turned)))
+    assert right.found and wrong.found
+    assert (np.diag(wrong.covariance) > 4 * np.diag(right.covariance)).all()
+    assert wrong.ambiguity < right.ambiguity
+
+
 def test_covariance_is_honest_where_the_tilt_folds():
     """Seen frontally by one eye, a marker's tilt shows by its square: noise makes it seem tilted, and known for it."""
     X, rng = facing(2.5, 0.0, 0.0, 0.3), np.random.default_rng(4)

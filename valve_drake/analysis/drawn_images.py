@@ -53,10 +53,10 @@ def _profile(n_u: float, blur: float) -> tuple[np.ndarray, np.ndarray]:
 class Canvas:
     """One camera's image while it is drawn, back to front. blur: of the lens, standard deviation [px]."""
 
-    def __init__(self, lens: LensModel, blur: float = 0.7, background: tuple[float, float, float] = WALL):
+    def __init__(self, lens: LensModel, blur: float = 0.7):
         self.lens, self.blur = lens, max(blur, 0.05)
         self.image = np.empty((lens.height, lens.width, 3))
-        self.image[:] = background
+        self.image[:] = WALL
         self._xy, self._jacobian = _grid(lens)
 
     def rectangle(self, X_CS: np.ndarray, color: tuple, half: tuple[float, float]) -> None:
@@ -110,7 +110,7 @@ class Canvas:
         """An ellipse; its edge is nobody's measure, so the pixel's square counts as a little more blur."""
         P = frames.apply(X_CS, _UNIT * [*half, 0])
         box = self._box(P)
-        if box is None or (P[:, 2] < _NEAR).any() or min(box[0].stop - box[0].start, box[1].stop - box[1].start) < 2:
+        if box is None or min(box[0].stop - box[0].start, box[1].stop - box[1].start) < 2:
             return
         H = np.linalg.inv(np.column_stack([X_CS[:, 0], X_CS[:, 1], X_CS[:, 3]]))
         xy = self._xy[box]

@@ -24,8 +24,8 @@ from valve_drake import frames, resources
 from valve_drake.analysis.drawn_images import GREEN, METAL, PLATE, RED, WALL, Canvas, draw_bar, draw_board
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import require, require_in
-from valve_drake.messages import CameraFrame, MarkerEdges, QuadEdges, Segmentation, SegmentationPair
-from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
+from valve_drake.messages import CameraFrame, MarkerEdges, QuadEdges, SegmentationPair
+from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
@@ -76,13 +76,11 @@ def converged(distance: float) -> StereoHead:
 # ---------------------------------------------------------------- images and what is read from them
 
 
-def draw(
-    X_LV: np.ndarray, eyes: StereoHead, marker: Marker, blur: float = BLUR, paint: Callable = draw_board
-) -> list[Canvas]:
+def draw(X_LV: np.ndarray, eyes: StereoHead, marker: Marker, paint: Callable = draw_board) -> list[Canvas]:
     """What both cameras see of the target, still without noise."""
     out = []
     for lens, X_CL in zip(eyes.lenses(), _to_cameras(eyes)):
-        canvas = Canvas(lens, blur)
+        canvas = Canvas(lens, BLUR)
         paint(canvas, frames.compose(X_CL, X_LV), marker)
         out.append(canvas)
     return out
@@ -93,9 +91,7 @@ def read(images: list[np.ndarray], eyes: StereoHead, marker: Marker) -> tuple[Se
     config = ColorSegmentationConfig()
     seen = []
     for image, camera in zip(images, _CAMERAS):
-        candidates, green = segment(image, config)
-        frame = CameraFrame(camera=camera, image=image)
-        seen.append(Segmentation(frame=frame, candidates=candidates, green=green))
+        seen.append(segmented(CameraFrame(camera=camera, image=image), config))
     pair = SegmentationPair(left=seen[0], right=seen[1])
     return pair, fit_pair(pair, eyes, marker, LineFittingConfig(), StereoPositioningConfig())
 
@@ -324,9 +320,7 @@ def bound(
     The mean of NEES / 6 over n pairs has a standard error of sqrt(2 / (6 n)): 0.033 for 300. Of 48 cells the extremes
     are then expected at 1 +- 0.08, so that one outside 0.9 .. 1.1 is the covariance's fault and not chance's.
     """
-    rows = []
-    for row in _bound_cells(seed, trials, distances, tilts):
-        rows.append(row)
+    rows = list(_bound_cells(seed, trials, distances, tilts))
     totals = {}
     for cameras in ("one", "two"):
         own = [row for row in rows if row["cameras"] == cameras]

@@ -10,7 +10,7 @@ import numpy as np
 
 from valve_drake.camera.lens import StereoHead
 from valve_drake.messages import CameraFrame, RectangleEstimate, Segmentation, SegmentationPair
-from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
+from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
@@ -52,9 +52,7 @@ def estimate_rectangle(
             raise ValueError(
                 f"{camera} image must be {lens.width} x {lens.height} RGB uint8, got {image.shape} {image.dtype}"
             )
-        candidates, green = segment(image, segmentation)
-        frame = CameraFrame(camera=camera, image=np.array(image))
-        seen.append(Segmentation(frame=frame, candidates=candidates, green=green))
+        seen.append(segmented(CameraFrame(camera=camera, image=np.array(image)), segmentation))
     pair = SegmentationPair(left=seen[0], right=seen[1])
     return estimate(fit_pair(pair, head, marker, lines, matching), head, marker, estimator, track)
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from valve_drake.checks import require, require_in
-from valve_drake.messages import MarkerCandidate, Mode
+from valve_drake.messages import CameraFrame, MarkerCandidate, Mode, Segmentation
 from valve_drake.perception.marker import NEXT
 
 # Red, green and brightness of RGB; the offset stands for the noise that would else make colours of black.
@@ -100,6 +100,14 @@ def segment(
     accepted = sorted((c for c in red if not c.rejected), key=lambda c: -c.score)
     rejected = sorted((c for c in red if c.rejected), key=lambda c: -c.area)
     return (*accepted, *rejected), _green_marks(shares, (x, y), config)
+
+
+def segmented(
+    frame: CameraFrame, config: ColorSegmentationConfig, roi: tuple[int, int, int, int] | None = None
+) -> Segmentation:
+    """The frame with what `segment` finds in it."""
+    candidates, green = segment(frame.image, config, roi)
+    return Segmentation(frame=frame, candidates=candidates, green=green)
 
 
 def green_regions(image: np.ndarray, config: ColorSegmentationConfig) -> list[Region]:

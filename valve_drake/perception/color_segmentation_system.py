@@ -12,7 +12,7 @@ import dataclasses as dc
 from typing import Any
 
 from valve_drake.messages import CameraFrame, MarkerCandidate, Mode, ModeState, Segmentation, SegmentationPair
-from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
+from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.ports import Block, Inputs
 
 _Box = tuple[int, int, int, int]
@@ -68,11 +68,11 @@ class ColorSegmentationSystem(Block):
         return memory, {"segmentation": pair}
 
     def _look(self, frame: CameraFrame, box: _Box | None) -> tuple[Segmentation, _Box | None]:
-        candidates, green = segment(frame.image, self._config, box)
-        if box is not None and not any(not c.rejected for c in candidates):
-            candidates, green = segment(frame.image, self._config)
-        accepted = [c for c in candidates if not c.rejected]
-        return Segmentation(frame=frame, candidates=candidates, green=green), _around(accepted, frame.image.shape)
+        seen = segmented(frame, self._config, box)
+        if box is not None and all(c.rejected for c in seen.candidates):
+            seen = segmented(frame, self._config)
+        accepted = [c for c in seen.candidates if not c.rejected]
+        return seen, _around(accepted, frame.image.shape)
 
 
 def _around(accepted: list[MarkerCandidate], shape: tuple[int, ...]) -> _Box | None:

@@ -39,7 +39,7 @@ _SHORT = 2 * _WINDOW + 2  # sides below have no corner pixels of their own [px]
 _CUT = 4.5  # a pixel further from the model is not the marker's [sigma]
 _POOR = 2.5  # mean square of a corner's pixels above which it is covered or worn [sigma^2]
 _SAMPLES = 16  # points on each side that stand for it
-_PRIOR_POINTS = 20  # how many points the pixels' noise counts for against the points' scatter
+PRIOR_POINTS = 20  # how many points the noise of the grey values counts for, against the points' scatter
 
 
 @dc.dataclass(frozen=True)
@@ -146,7 +146,7 @@ def joint_fit(
 
     channel (H, W); curves of the four sides, level (4, 4) their own levels; seen, bend (4,): prior on each bend;
     scatter: chi^2 of the edge points about their sides times sigma^2, and its degrees of freedom. None where the
-    light is not that of two planes.
+    light is not that of two planes, there are too few pixels to tell, or the sides do not meet.
     """
     middle = curves.points(curves.first[:, None] + (curves.count[:, None] - 1) * np.array([0.0, 0.5, 1.0]))
     halves = middle[:, 1]
@@ -195,7 +195,7 @@ def joint_fit(
     K = np.zeros((8, 19))
     K[_ROWS, _ROWS // 2 * 3 + 6], K[_ROWS, _ROWS // 2 * 3 + 7] = 1, final.tau(t).ravel()  # undistorted, none has a bend
     chi2, n = scatter
-    spread = (chi2 / variance + _PRIOR_POINTS) / (n + _PRIOR_POINTS)
+    spread = (chi2 / variance + PRIOR_POINTS) / (n + PRIOR_POINTS)
     covariance = variance * spread * (K @ np.linalg.solve(H, K.T))
     even = curves.first[:, None] + (curves.count[:, None] - 1) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     return final.points(even), np.linalg.inv(covariance)

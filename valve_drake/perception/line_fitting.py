@@ -23,7 +23,7 @@ from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require_in
 from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, SegmentationPair
 from valve_drake.perception.color_segmentation import polygon_area
-from valve_drake.perception.joint_fit import Curves, basis, joint_fit, meet, normal_cdf, sums
+from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, basis, joint_fit, meet, normal_cdf, sums
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig, match, single, wrong_size
 
@@ -36,8 +36,9 @@ _LARGE = 100  # of a quadrilateral of this size coarse lines are looked for at h
 _EVEN = 0.1  # deviation over mean of the marker's inside above which a shadow is looked for
 _ONE_HUE = 0.96  # least cosine between the marker's colour in the shadow and in the light
 _TWO_LEVELS = 0.25  # share of that variance which two lights leave unexplained at most
+_LEAST_HALF = 2  # half a profile's length at a side's ends, where the light plate is narrowest [px] ...
+_LEAN = 2.5  # ... and the pixels along the side that it needs for one more
 _ENOUGH = 30  # profiles of a side that find the way to its edge
-_PRIOR_POINTS = 20  # how many points the noise predicted from the grey values counts for, against the scatter seen
 
 
 @dc.dataclass
@@ -331,9 +332,7 @@ class _Sides:
     start: np.ndarray  # position across the side at t = 0 ...
     slope: np.ndarray  # ... and its change with t
     inward: np.ndarray  # +-1: the way across the side that leads inside
-    half: int  # of a profile [px] ...
-    spare: np.ndarray  # ... and by how much less it is at a side's ends, where it would meet the next side
-    lean: np.ndarray  # pixels along t that a profile needs for one more pixel of its half
+    half: int  # of a profile [px]
 
 
 def _place(channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig, least: float = 0.0) -> _Sides | str:
@@ -353,9 +352,7 @@ def _place(channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig, 
     # A profile must reach neither the opposite side nor the rim of the light plate round the marker.
     width = polygon_area(corners) / lengths.max()
     half = int(max(min(max(round(config.reach * width), 3), config.half_window), min(least, 0.3 * width)))
-    # The light plate is narrowest at the corners: profiles are short there, and grow with the distance from them.
-    least_half = min(half, 2)
-    reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 3.0)) + least_half * np.abs(slope) * cosine
+    reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 3.0)) + _LEAST_HALF * np.abs(slope) * cosine
     begin = np.minimum(corners[_FOUR, t_axis], ends[_FOUR, t_axis]) + reach * cosine
     stop = np.maximum(corners[_FOUR, t_axis], ends[_FOUR, t_axis]) - reach * cosine
     limit = np.where(flat, channel.shape[1], channel.shape[0]) - 1
@@ -365,15 +362,14 @@ def _place(channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig, 
         return f"side {int(np.argmin(count))} short"
     start = corners[_FOUR, 1 - t_axis] - slope * corners[_FOUR, t_axis]
     inward = np.sign(corners.mean(0)[1 - t_axis] - (corners + ends)[_FOUR, 1 - t_axis] / 2)
-    lean = np.maximum(np.abs(slope) * cosine**2, 2.5)
-    return _Sides(channel, flat, first, count, start, slope, inward, half, np.full(4, half - least_half), lean)
+    return _Sides(channel, flat, first, count, start, slope, inward, half)
 
 
 def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
     """Step 3: the sides of all quadrilaterals together, as arrays (S sides, N profiles, M pixels)."""
-    flat, first, count, start, slope, inward, spare, lean = (
+    flat, first, count, start, slope, inward = (
         np.concatenate([getattr(q, name) for q in quads])
-        for name in ("flat", "first", "count", "start", "slope", "inward", "spare", "lean")
+        for name in ("flat", "first", "count", "start", "slope", "inward")
     )
     half = np.repeat([float(q.half) for q in quads], 4)
     tall, wide = (np.repeat([q.channel.shape[k] for q in quads], 4) for k in (0, 1))
@@ -395,8 +391,8 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         used = k < count[:, None]
         tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1 along each side
         from_end = np.minimum(k, count[:, None] - 1 - k)
-        room = half[:, None] - np.maximum(spare[:, None] - from_end / np.maximum(lean, 1e-3)[:, None], 0)
-        room = (np.minimum(room, half[:, None]) + 1).astype(np.float32)[:, :, None]  # (S, N, 1)
+        room = half[:, None] - np.maximum(half[:, None] - _LEAST_HALF - from_end / _LEAN, 0)
+        room = (room + 1).astype(np.float32)[:, :, None]  # (S, N, 1)
         line = start[:, None] + slope[:, None] * t
         middle = np.rint(line)
         y = middle.astype(np.int32)[:, :, None] + across  # (S, N, M)
@@ -479,7 +475,7 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         n = int(keep.sum())
         freedom = n - 8 - int((bend[own] < 1).sum())
         sigma = np.sqrt(
-            (deviation[own].sum() + _PRIOR_POINTS * predicted[own].sum() / max(n, 1)) / (freedom + _PRIOR_POINTS)
+            (deviation[own].sum() + PRIOR_POINTS * predicted[own].sum() / max(n, 1)) / (freedom + PRIOR_POINTS)
         )
         sigma *= np.sqrt(np.mean(1 / kept[own]))
         reason = ""

@@ -15,11 +15,11 @@ import numpy as np
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import ConfigError
 from valve_drake.messages import CameraFrame, MarkerEdges, QuadEdges, RectangleEstimate, Segmentation, SegmentationPair
-from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
+from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, estimate
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig
+from valve_drake.perception.stereo_positioning import StereoPositioningConfig, turn_between
 
 _SLACK = 3.0  # by how many rms of its calibration a head may be off
 
@@ -61,10 +61,7 @@ def look(
         config.check()
     seen = []
     for name, image in zip(("left", "right"), images):
-        candidates, green = segment(image, coloring)
-        seen.append(
-            Segmentation(frame=CameraFrame(camera=name, image=np.array(image)), candidates=candidates, green=green)
-        )
+        seen.append(segmented(CameraFrame(camera=name, image=np.array(image)), coloring))
     pair = SegmentationPair(left=seen[0], right=seen[1] if len(seen) == 2 else Segmentation())
     edges = fit_pair(pair, head, marker, lines, matching)
     shift = np.zeros(2)
@@ -84,7 +81,7 @@ def look(
             in_each = (model, (model - head.X_LR[:, 3]) @ head.X_LR[:, :3])
             corners = [_fitted(P, quad, lens) if quad.found else None for P, quad, lens in zip(in_each, quads, lenses)]
         elif len(corners) == 2 and corners[0] is not None and corners[1] is not None:
-            corners[1] = _same_order(corners[0], corners[1])
+            corners[1] = np.roll(corners[1], -turn_between(corners[0], corners[1]), axis=0)
     epipolar = float(np.linalg.norm(shift)) * head.right.focal()
     return Look(estimate=found, seen=tuple(seen), edges=quads, corners_px=tuple(corners), epipolar_px=epipolar)
 
@@ -117,9 +114,3 @@ def _fitted(P: np.ndarray, quad: QuadEdges, lens: LensModel) -> np.ndarray:
         keep = np.abs(left) <= 4 * np.median(np.abs(left)) + 1e-12
         own, n = own[keep], n[keep]
     return lens.project(corners + shift)
-
-
-def _same_order(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Corners `b` counted from the one that corresponds to the first of `a`."""
-    one, other = a - a.mean(0), b - b.mean(0)
-    return np.roll(b, -min(range(4), key=lambda k: float(((one - np.roll(other, -k, axis=0)) ** 2).sum())), axis=0)
