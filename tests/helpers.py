@@ -1,5 +1,6 @@
 """What the tests of blocks share: one block alone in a simulator, its inputs fixed by hand."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, PortDataType
 
 from valve_drake.messages import Message
-from valve_drake.ports import SLOT, TICK, Block
+from valve_drake.ports import SLOT, TICK, Block, Inputs
 
 
 class Rig:
@@ -29,6 +30,18 @@ class Rig:
 
     def read(self, port: str, context: Context | None = None) -> Any:
         return self.block.GetOutputPort(port).Eval(self.context if context is None else context)
+
+
+class SourceBlock(Block):
+    """A block without inputs whose single output is `value(time)`."""
+
+    def __init__(self, name: str, kind: type, value: Callable[[float], Any], *, period: float = TICK, slot: int = 0):
+        self.OUTPUTS = {"value": kind}
+        self._value = value
+        super().__init__(name, period=period, slot=slot)
+
+    def step(self, time: float, inputs: Inputs, memory: Any) -> tuple[Any, dict[str, Any]]:
+        return None, {"value": self._value(time)}
 
 
 def ports(block: Block) -> dict[str, str | int]:

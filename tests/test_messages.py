@@ -53,6 +53,17 @@ def test_an_array_is_copied_so_that_the_giver_may_go_on_using_it():
         message.odometry[0] = 1
 
 
+def test_an_array_that_nobody_can_change_is_shared_and_a_view_of_another_is_not():
+    first = RobotState(odometry=np.arange(5.0))
+    assert RobotState(odometry=first.odometry).odometry is first.odometry
+    given = np.arange(8.0)
+    view = given[:5]
+    view.setflags(write=False)
+    message = RobotState(odometry=view)
+    given[:] = 7
+    assert message.odometry.tolist() == [0, 1, 2, 3, 4]
+
+
 def test_integers_become_floats_and_any_length_is_any_length():
     assert Health(devices=("a", "b"), ages=[1, 2]).ages.dtype == np.float64
     assert Segmentation(green=[]).green.shape == (0, 3)

@@ -4,13 +4,13 @@ import dataclasses as dc
 
 import numpy as np
 import pytest
-from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+from helpers import Rig, SourceBlock, assert_clones_are_independent, assert_holds_between_updates, ports
 from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from valve_drake.messages import Health, Status, StereoPosition
-from valve_drake.ports import SLOT, TICK, Block, SourceBlock, profile
+from valve_drake.ports import SLOT, TICK, Block, profile
 
 
 class Counter(Block):
@@ -176,3 +176,19 @@ def test_profile_counts_every_second_once():
     outer = profile.seconds["outer of the test"]
     assert inner > 0 and 0 <= outer < inner
     assert before.get("stages", 0) == profile.seconds.get("stages", 0)
+
+
+def test_an_error_of_who_is_read_is_not_taken_for_a_port_without_a_value():
+    class Failing(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorOutputPort("a", 2, self.calc)
+
+        def calc(self, context, output):
+            raise RuntimeError("no image")
+
+    builder = DiagramBuilder()
+    source, block = builder.AddSystem(Failing()), builder.AddSystem(Counter())
+    builder.Connect(source.GetOutputPort("a"), block.GetInputPort("a"))
+    with pytest.raises(RuntimeError, match="no image"):
+        Simulator(builder.Build()).AdvanceTo(TICK)

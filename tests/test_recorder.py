@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from helpers import SourceBlock
 from log_samples import same
 from pydrake.geometry import Box, Cylinder, Mesh, Sphere
 from pydrake.math import RigidTransform
@@ -13,12 +14,16 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
+from valve_drake import frames, resources
 from valve_drake import messages as ms
-from valve_drake.ports import TICK, SourceBlock, profile
+from valve_drake.camera.lens import load_head
+from valve_drake.perception.marker import Marker
+from valve_drake.ports import TICK, profile
 from valve_drake.recording import foxglove
 from valve_drake.recording.layout import PLOTS, VISIBLE_3D, layout
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recorder_system import ONCE, RecorderSystem, Signal
+from valve_drake.recording.robot_frames import RobotFrames
 from valve_drake.recording.scene import parts_of, scene
 from valve_drake.recording.schemas import Vector, Wrench, parsed
 from valve_drake.recording.signals import JOINED, MEASURED, as_it_is, joints, output, signals, status_line, vector
@@ -284,6 +289,26 @@ def test_frames_poses_and_calibrations(log):
     assert log.topics["/head_left/calibration"].count == 2
     _, t, found = next(log.messages(["/rectangle_estimator/pose"]))
     assert t > 0.1 and found.pose.orientation.w == 1.0
+
+
+def test_the_wheel_turns_with_the_marker_and_the_panel_stays():
+    marker = Marker()
+    belief = RobotFrames(load_head(resources.models() / "calibration" / "head.yaml"), marker)
+    X_BV = frames.make(frames.rot_y(0.2), np.array([0.6, 0.1, 1.2]))
+    found = {}
+    for angle in (0.0, 0.7):
+        plan, turn = ms.GraspPlan(found=True, X_BV=X_BV), ms.TurnState(angle=angle)
+        tree = belief(ms.RobotState(), ms.RectangleEstimate(), plan, turn)
+        found[angle] = {child: (parent, X) for parent, child, X in tree}
+    (odometry, start), (_, end) = (found[angle]["marker"] for angle in (0.0, 0.7))
+    np.testing.assert_allclose(start[:, :3].T @ end[:, :3], frames.rot_z(-0.7), atol=1e-12)
+    for angle in found:
+        parent, X = found[angle]["valve::wheel"]
+        assert parent == "marker" and X[:, 3].tolist() == [0, 0, marker.panel_depth]
+        parent, X = found[angle]["valve::panel"]
+        assert parent == odometry
+        np.testing.assert_allclose(X[:, :3], start[:, :3], atol=1e-12)
+        np.testing.assert_allclose(X[:, 3] - start[:, 3], marker.panel_depth * start[:, 2], atol=1e-12)
 
 
 def test_truth_may_be_cut_without_a_trace_on_other_topics(log, tmp_path):

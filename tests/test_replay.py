@@ -201,8 +201,9 @@ def test_another_image_threshold_is_found_in_the_first_image(path, log, capsys):
     out = capsys.readouterr().out
     looked = next(t for _, t, p in log.messages(["/color_segmentation/segmentation"]) if p.sequence >= 0)
     assert f"different from t = {looked:.4f} s: /color_segmentation/segmentation left.candidates" in out
-    for _, replayed, equal in re.findall(r"/head_left/image +(\d+) +(\d+) +(\d+)", out):
-        assert replayed == equal  # it looks less often, as it stays in search; what it looks at is as recorded
+    images = re.findall(r"/head_(?:left|right)/image +\d+ +(\d+) +(\d+)", out)
+    assert len(images) == 2  # it looks less often, as it stays in search; what it looks at is as recorded
+    assert all(replayed == equal for replayed, equal in images)
 
 
 def test_the_replays_own_log_is_the_same_without_the_truth_and_can_be_replayed(path, log, tmp_path, capsys):

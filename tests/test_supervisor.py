@@ -34,10 +34,10 @@ RUNNING = [m for m in Mode if m not in TERMINAL and m != Mode.IDLE]
 class Bench:
     """The supervisor with behaviours that answer by a script: script(state) -> {block: Status fields}."""
 
-    def __init__(self, state: State = State(), time: float = 0.0):
-        self.state, self.time = state, time
+    def __init__(self, state: State | None = None, time: float = 0.0):
+        self.state, self.time = state or State(), time
         self.operator = OPEN
-        self.modes = [state.mode]
+        self.modes = [self.state.mode]
         self.health: dict = {}
         self.selector: dict = {}
         self.health_delay = 0.0
@@ -499,7 +499,8 @@ def test_ages_are_judged_by_device():
 
     assert fault("left_arm", CONFIG.other_age) == ""
     assert "left_arm silent" in fault("left_arm", CONFIG.other_age + 0.01)
-    assert fault("head_left", 0.9) == "" and fault("head_left", 1.1)
+    for camera in ("head_left", "left_wrist"):
+        assert fault(camera, 0.9) == "" and fault(camera, 1.1)
     assert find_fault(CONFIG, 5.0, None, None)
     assert find_fault(CONFIG, 5.0, Health(time=5.0), SelectorReport(time=4.0)) == "no report from command_selector"
 

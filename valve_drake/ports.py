@@ -16,7 +16,6 @@ Every block uses UNRESTRICTED updates: a discrete update would see the plant alr
 """
 
 import time as _time
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -153,15 +152,3 @@ class _Held:
 
     def __deepcopy__(self, memo: dict) -> "_Held":
         return self
-
-
-class SourceBlock(Block):
-    """A block without inputs whose single output is `value(time)`: operator commands, test signals."""
-
-    def __init__(self, name: str, kind: type, value: Callable[[float], Any], *, period: float = TICK, slot: int = 0):
-        self.OUTPUTS = {"value": kind}
-        self._value = value
-        super().__init__(name, period=period, slot=slot)
-
-    def step(self, time: float, inputs: Inputs, memory: Any) -> tuple[Any, dict[str, Any]]:
-        return None, {"value": self._value(time)}

@@ -34,11 +34,6 @@ class Board:
         xx, yy = np.meshgrid(x, y)
         return np.stack([xx, yy, np.zeros_like(xx)], -1).reshape(-1, 3)
 
-    def rim(self) -> np.ndarray:
-        """Indices (4,) of the outermost corners, clockwise as the camera sees them."""
-        n = self.columns * self.rows
-        return np.array([0, self.columns - 1, n - 1, n - self.columns])
-
     def symmetric(self) -> bool:
         """Whether it looks the same turned by half a turn, so that images alone do not tell which way it is up."""
         return (self.columns + self.rows) % 2 == 0
