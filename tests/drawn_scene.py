@@ -122,9 +122,7 @@ def edge_points(
             side += [k] * n
         corners_px = lens.project(xy)
         quads.append(
-            QuadEdges(
-                found=True, points=np.vstack(points), side=side, sigma=sigma, corners=xy, corners_px=corners_px
-            )
+            QuadEdges(found=True, points=np.vstack(points), side=side, sigma=sigma, corners=xy, corners_px=corners_px)
         )
     return MarkerEdges(time=0.0, sequence=0, left=quads[0], right=quads[1])
 

@@ -397,7 +397,7 @@ def test_a_new_activation_starts_afresh():
     robot = RobotState(odometry=np.array([-1.5, 0.0, 0, 0, 0]))
     memory, result = Memory(), []
     for activation, count in ((1, 200), (2, 1)):
-        for k in range(count):
+        for _ in range(count):
             t = len(result) * DT
             seen = scene.look(t, robot.odometry[:3])
             mode = ModeState(mode="rough_approach", activation=activation)

@@ -64,6 +64,7 @@ def test_area_does_not_depend_on_light():
 
 def test_feature_moves_linearly_with_the_hand():
     """The point of (u, v, 1) / sqrt(area): one Jacobian for the whole workspace."""
+
     def feature(x, y, z):
         return find_mark(wrist_image(facing(z, 0.3, 0.2, 0.2, x, y), None), CONFIG).feature
 

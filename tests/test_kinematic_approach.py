@@ -147,9 +147,7 @@ def assert_smooth(commands: list[np.ndarray]) -> None:
 # ---------------------------------------------------------------- at home
 
 
-@pytest.mark.parametrize(
-    "mode", [Mode.IDLE, Mode.SEARCH, Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT]
-)
+@pytest.mark.parametrize("mode", [Mode.IDLE, Mode.SEARCH, Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT])
 def test_where_it_has_nothing_else_to_do_the_arms_go_home_and_stay(base, mode):
     bench = Bench(base, arms=HOME + np.tile([0.2, -0.1, 0.3, 0.4, -0.2, 0.1], 2))
     start = bench.arms

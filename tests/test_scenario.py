@@ -35,7 +35,9 @@ def test_a_fixed_number_changes_no_other_draw():
 
 
 def test_close_starts_open_and_an_explicit_position_stays():
-    assert mut.resolve(mut.load(None, ["command=close"])).simulation.valve.position == pytest.approx(np.pi / 2, abs=1e-4)
+    assert mut.resolve(mut.load(None, ["command=close"])).simulation.valve.position == pytest.approx(
+        np.pi / 2, abs=1e-4
+    )
     assert mut.resolve(mut.load(None, [])).simulation.valve.position == 0.0
     given = ["command=close", "simulation.valve.position=0.7"]
     assert mut.resolve(mut.load(None, given)).simulation.valve.position == 0.7

@@ -90,7 +90,7 @@ def test_check_contract_names_what_is_missing_extra_and_different():
 
 
 def test_the_robot_stands_still_at_home(rig):
-    for k, side in enumerate(SIDES):
+    for side in SIDES:
         home = initial_commands(rig.scenario)[f"{side}_arm.position_command"]
         np.testing.assert_allclose(rig.read(f"{side}_arm.position_measured"), home, atol=2e-4)
         assert np.abs(rig.read(f"{side}_arm.velocity_measured")).max() < 1e-3
@@ -134,9 +134,9 @@ def test_odometry_drifts_with_errors():
 
 
 def test_the_gripper_keeps_its_force_limit_on_the_hand_itself():
-    rig = Rig(
-        **{"left_gripper.position_command": np.array([0.0]), "left_gripper.force_limit": np.array([30.0])}
-    ).run(1.0)
+    rig = Rig(**{"left_gripper.position_command": np.array([0.0]), "left_gripper.force_limit": np.array([30.0])}).run(
+        1.0
+    )
     assert rig.read("left_gripper.position_measured")[0] < 0.002
     assert rig.read("left_gripper.force_measured")[0] <= 30.5
 

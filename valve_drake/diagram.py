@@ -186,7 +186,8 @@ def make_diagram(
 ) -> System:
     """The whole system for a resolved scenario; `recording` is what station `replay` shows, `link` leads to a robot.
 
-    workers: make the simulated cameras' images beside the run. truth=False leaves the recorder without the `truth.*` ports.
+    workers: make the simulated cameras' images beside the run. truth=False leaves the recorder without the `truth.*`
+    ports.
     """
     builder = DiagramBuilder()
     station = builder.AddSystem(make_station(scenario, meshcat, recording, workers, link))

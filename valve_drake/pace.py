@@ -14,7 +14,6 @@ import numpy as np
 from valve_drake.messages import Message
 from valve_drake.ports import TICK
 
-
 PACE = "/pace"  # its topic
 
 

@@ -237,9 +237,7 @@ class HybridRotation:
         V = V if sound else np.zeros((2, 6))
         m = self._move(dt, m, V, chain)
         m = dc.replace(m, telemetry=self._telemetry(time, m, chain))
-        command = Command(
-            time=time, left_arm=m.q[0], right_arm=m.q[1], left_gripper=gripper, right_gripper=gripper
-        )
+        command = Command(time=time, left_arm=m.q[0], right_arm=m.q[1], left_gripper=gripper, right_gripper=gripper)
         return m, command
 
     # ------------------------------------------------------------ sensing
@@ -250,9 +248,7 @@ class HybridRotation:
             still = max(np.max(np.abs(state.left_arm_velocity)), np.max(np.abs(state.right_arm_velocity))) < 0.02
             if not still or not np.all(np.isfinite(raw)):
                 return dc.replace(m, tared=False) if m.tared else m
-            load = np.array(
-                [raw[k] - gravity_wrench(X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)]
-            )
+            load = np.array([raw[k] - gravity_wrench(X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)])
             a = 1 - np.exp(-dt / self.config.tare_time)
             bias = m.bias + a * (load - m.bias) if m.tared else load
             return dc.replace(m, bias=bias, tared=True, wrenches=np.zeros((2, 6)))

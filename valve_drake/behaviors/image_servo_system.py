@@ -31,7 +31,5 @@ class ImageServoSystem(Block):
         return Memory()
 
     def step(self, time: float, inputs: Inputs, memory: Memory) -> tuple[Memory, dict[str, Any]]:
-        memory, command, servo = self._law.step(
-            time, TICK, memory, inputs.robot_state, inputs.mode, inputs.marks
-        )
+        memory, command, servo = self._law.step(time, TICK, memory, inputs.robot_state, inputs.mode, inputs.marks)
         return memory, {"command": command, "status": memory.status, "servo": servo}

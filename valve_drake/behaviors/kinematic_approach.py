@@ -225,9 +225,7 @@ class KinematicApproach:
         fused = fuse(looks)
         if not fused.found:
             return m
-        base, margin = find_stance(
-            fused.X_OV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view
-        )
+        base, margin = find_stance(fused.X_OV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view)
         good = margin >= self.stance.margin_min
         reason = "" if good else f"no stance holds both handles through the turn (margin {margin:.2f})"
         return dc.replace(m, stance=Stance(time=estimate.time, found=good, base=base, margin=margin, reason=reason))

@@ -216,9 +216,7 @@ def _minimize(problem: Callable, state: Any, moved: Callable, steps: int = 200) 
     """Levenberg-Marquardt from `state` until no step is expected to matter -> the best state, problem(state)."""
     at = problem(state)
     if not math.isfinite(at[0]):
-        raise ConfigError(
-            "the calibration has no start: do the images, and the poses, belong together?"
-        )
+        raise ConfigError("the calibration has no start: do the images, and the poses, belong together?")
     damping = 1e-4
     for _ in range(steps):
         cost, H, g = at[:3]

@@ -148,7 +148,9 @@ class CameraRig:
         noise = self._noise[start : start + image.size].reshape(image.shape)
         values = cv2.multiply(image, (*self._gains, 0.0), dtype=cv2.CV_32F)
         values = cv2.scaleAdd(noise, c.noise, values)
-        return encode_frame(name, capture.time, capture.sequence, cv2.convertScaleAbs(cv2.max(values, 0.0)), c.jpeg_quality)
+        return encode_frame(
+            name, capture.time, capture.sequence, cv2.convertScaleAbs(cv2.max(values, 0.0)), c.jpeg_quality
+        )
 
     def view(self, X_WC: np.ndarray, q: np.ndarray, width: int, height: int, fov_y: float) -> np.ndarray:
         """A picture from anywhere, for people (height, width, 3)."""

@@ -246,9 +246,7 @@ def step(
 
 def measured(state: RobotState) -> np.ndarray:
     """Measured joint positions in the order of JOINTS -> (17,)."""
-    return np.concatenate(
-        [state.torso, state.left_arm, state.right_arm, [state.left_gripper, state.right_gripper]]
-    )
+    return np.concatenate([state.torso, state.left_arm, state.right_arm, [state.left_gripper, state.right_gripper]])
 
 
 def _sources(
@@ -339,9 +337,7 @@ def _joints(
     return position, velocity, target, changed
 
 
-def _force(
-    config: CommandSelectorConfig, m: Memory, wanted: dict[str, np.ndarray]
-) -> tuple[np.ndarray, list[str]]:
+def _force(config: CommandSelectorConfig, m: Memory, wanted: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str]]:
     asked = np.array([wanted[g][1] if g in wanted else m.force[k] for k, g in enumerate(GRIPPERS)])
     force = np.minimum(asked, config.gripper_force)
     return force, [f"{g}.force" for k, g in enumerate(GRIPPERS) if force[k] != asked[k]]

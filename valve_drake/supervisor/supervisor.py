@@ -181,9 +181,7 @@ def deadline(config: SupervisorConfig, state: State) -> float:
     return config.deadline.get(state.mode.value, math.inf) + extra
 
 
-def find_fault(
-    config: SupervisorConfig, time: float, health: Health | None, selector: SelectorReport | None
-) -> str:
+def find_fault(config: SupervisorConfig, time: float, health: Health | None, selector: SelectorReport | None) -> str:
     """The first reason not to go on, or "". Comparisons are written so that NaN counts as a fault."""
     if health is None or not time - health.time <= config.report_age:
         return "no health report"
