@@ -81,7 +81,7 @@ class Puppet:
             self.tick += 1
             self.now += TICK
             self.report(**report)
-            shown = self.link.update(self.tick * TICK - SLOT)
+            shown = self.link.update(self.tick * TICK)
         return shown
 
     def age(self, shown, device):

@@ -212,6 +212,22 @@ def test_a_pacer_keeps_its_period_counts_what_is_late_and_makes_nothing_up(monke
     assert pace.median == pytest.approx(0.002)
 
 
+def test_what_follows_the_commands_is_not_of_a_ticks_time_but_can_make_the_next_one_late(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("valve_drake.pace.wall.monotonic", lambda: clock[0])
+    pacer = Pacer(0.01, idle=lambda left: clock.__setitem__(0, clock[0] + left))
+
+    def passes(seconds):
+        clock[0] += seconds
+
+    for after in (0.001, 0.012, 0.001):
+        pacer.tick(lambda: passes(0.002), lambda after=after: passes(after))
+    pace = pacer.report(0.0)
+    assert pace.longest == pytest.approx(0.002)
+    assert pace.missed == 1 and pace.lost == pytest.approx(0.004)
+    assert clock[0] == pytest.approx(0.027)
+
+
 # ---------------------------------------------------------------- the whole, in one process
 
 

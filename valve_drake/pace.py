@@ -26,7 +26,7 @@ class Pace(Message):
 
     time: float = 0.0  # [s]
     ticks: int = 0
-    missed: int = 0  # ticks that ended after the next one should have begun
+    missed: int = 0  # ticks that ended, with all that follows the commands, after the next one should have begun
     lost: float = 0.0  # by how much wall time has run ahead [s]
     median: float = 0.0  # of a tick's time [s]
     p99: float = 0.0
@@ -49,15 +49,16 @@ class Pacer:
         self._missed = 0
         self._lost = 0.0
 
-    def tick(self, work: Callable[[], None]) -> None:
-        """Waits until a tick is due, then does its work."""
+    def tick(self, work: Callable[[], None], rest: Callable[[], None] = lambda: None) -> None:
+        """Waits until a tick is due, then does its work, whose time is taken, and the rest of it."""
         if math.isnan(self.due):
             self.due = wall.monotonic()
         self.wait(self.due)
         begin = wall.monotonic()
         work()
+        self._times.append(wall.monotonic() - begin)
+        rest()
         end = wall.monotonic()
-        self._times.append(end - begin)
         self.due += self._period
         if end > self.due:
             self._missed += 1

@@ -8,9 +8,11 @@ Time inside one control tick of 1/128 s is cut into four slots of 1/512 s, so th
 joints within one tick and no two blocks that feed each other run at the same instant:
 
     slot 0  robot_state (measurements are gathered)
-    slot 1  perception and behaviours
+    slot 1  behaviours
     slot 2  command_selector
-    slot 3  supervisor, and the station's wrench sensors for the next tick
+    slot 3  supervisor, perception, and the station's wrench sensors, all for the next tick
+
+On a robot the commands leave at the beginning of slot 3: what takes longest, to look at an image, holds up none.
 
 Every block uses UNRESTRICTED updates: a discrete update would see the plant already stepped.
 """

@@ -41,7 +41,7 @@ class ColorSegmentationSystem(Block):
     ):
         config.check()
         self._config = config
-        super().__init__(name, period=period, slot=1, delay=delay)
+        super().__init__(name, period=period, slot=3, delay=delay)
 
     def initial(self) -> _Memory:
         return _Memory()

@@ -37,7 +37,7 @@ class LineFittingSystem(Block):
         self._matching = matching or StereoPositioningConfig()
         for part in (self._config, self._marker, self._matching):
             part.check()
-        super().__init__(name, period=period, slot=1, delay=delay)
+        super().__init__(name, period=period, slot=3, delay=delay)
 
     def initial(self) -> int:
         return -1

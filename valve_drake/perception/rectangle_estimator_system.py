@@ -54,7 +54,7 @@ class RectangleEstimatorSystem(Block):
         self._marker = marker or Marker()
         self._config.check()
         self._marker.check()
-        super().__init__(name, period=period, slot=1, delay=delay)
+        super().__init__(name, period=period, slot=3, delay=delay)
 
     def initial(self) -> _Memory:
         return _Memory()

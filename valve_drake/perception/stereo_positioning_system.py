@@ -42,7 +42,7 @@ class StereoPositioningSystem(Block):
         self._marker = marker or Marker()
         self._config.check()
         self._marker.check()
-        super().__init__(name, period=period, slot=1, delay=delay)
+        super().__init__(name, period=period, slot=3, delay=delay)
 
     def initial(self) -> int:
         return -1

@@ -62,6 +62,7 @@ LOOKED_AT = 0.75  # after the last look at a camera it is requested for this lon
 DELAYS = 2.0  # the least delay is taken over this long [s]
 RESTART = 0.5  # a stamp that goes back by more is a driver begun anew; it is reported for as long [s]
 DECODING = 5e-3  # that an image takes, with room [s]
+AHEAD = SLOT / 2  # the station is read this long before a tick, when the last one's slot 3 is done [s of the diagram]
 HEALTH_TICKS = 4  # health is reported every 1/32 s
 
 
@@ -126,7 +127,7 @@ class RobotLink:
         self._complaints: dict[str, tuple[str, float]] = {}  # device -> what was wrong, and when
         self._delays: collections.deque = collections.deque()  # (time, least delay of a tick)
         self._delay = math.inf  # the least one of this tick's reports
-        self._time = -SLOT  # of the diagram, when what arrives now will be looked at
+        self._time = 0.0  # of the tick that looks at what arrives now [s of the diagram]
         self._heard = 0  # messages since the start of lock-step
         self._sync = (-2, 0)  # tick, messages
         self._sent_before = 0
@@ -187,7 +188,7 @@ class RobotLink:
             arrival = last.arrival
         self._reports[key] = _Report(stamp, arrival, values)
         if CHANNELS[key].read is not None:
-            self._delay = min(self._delay, self._time + SLOT - from_utime(stamp))
+            self._delay = min(self._delay, self._time - from_utime(stamp))
         return True
 
     def _take_image(self, camera: str, key: str, image: Any) -> None:
@@ -275,16 +276,16 @@ class RobotLink:
 
     # ------------------------------------------------------------ every tick
     def update(self, time: float) -> Snapshot:
-        """What is known at `time`, one slot before a tick."""
+        """What is known to the tick that begins at `time`."""
         self._time = time
         if self._config.lockstep:
-            self._await_tick(round((time + SLOT) / TICK))
+            self._await_tick(round(time / TICK))
         while self.bus.pump():
             pass
         return self._look()
 
     def _look(self) -> Snapshot:
-        now, time = self.clock(), self._time + SLOT
+        now, time = self.clock(), self._time
         if math.isfinite(self._delay):
             self._delays.append((time, self._delay))
         while self._delays and time - self._delays[0][0] > DELAYS:
@@ -390,7 +391,7 @@ class LcmReceiver(LeafSystem):
         self._snapshot = self.DeclareAbstractState(Value(BEFORE))
         self.DeclareInitializationUnrestrictedUpdateEvent(lambda context, state: self._keep(state, link.start()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(
-            TICK, 3 * SLOT, lambda context, state: self._keep(state, link.update(context.get_time()))
+            TICK, TICK - AHEAD, lambda context, state: self._keep(state, link.update(context.get_time() + AHEAD))
         )
         when = {self.abstract_state_ticket(self._snapshot)}
         for spec in CONTRACT:

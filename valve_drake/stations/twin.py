@@ -12,6 +12,7 @@ lock-step with the program.
 """
 
 import math
+import os
 import time as wall
 from collections.abc import Mapping
 from typing import Any
@@ -69,6 +70,13 @@ class LiveImages(CameraWorkers):
     def __init__(self) -> None:
         super().__init__()
         self.wanted: set[str] = set()
+
+    def start(self, *rig: object) -> "LiveImages":
+        super().start(*rig)
+        if hasattr(os, "SCHED_IDLE"):  # Linux: rather a late image than a late tick of either side
+            for worker in self._workers:
+                os.sched_setscheduler(worker.process.pid, os.SCHED_IDLE, os.sched_param(0))
+        return self
 
     def captured(self, name: str, capture: Capture) -> None:
         if capture.sequence == 0:  # the first image takes a renderer seconds, and nobody has asked for it
