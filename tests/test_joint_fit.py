@@ -85,11 +85,11 @@ def test_light_that_differs_from_side_to_side_keeps_the_sides_apart():
 def test_a_corner_that_is_worn_off_is_not_used(wear, monkeypatch):
     X, rng, used, look = pose(1.0), np.random.default_rng(2), [], mut._corner_pixels
 
-    def spy(channel, curves, ends, planes, blur, frame, variance):
-        J, r = look(channel, curves, ends, planes, blur, frame, variance)
-        px = frame[0] + frame[1] * J[:, 1:3]
-        used.append(set(np.linalg.norm(px[:, None] - ends, axis=2).argmin(1).tolist()))
-        return J, r
+    def spy(images, curves, ends, planes, blur, frame, variance, wanted):
+        J, r, owner = look(images, curves, ends, planes, blur, frame, variance, wanted)
+        px = frame[0][0] + frame[1][0] * J[:, 1:3]
+        used.append(set(np.linalg.norm(px[:, None] - ends[0], axis=2).argmin(1).tolist()))
+        return J, r, owner
 
     monkeypatch.setattr(mut, "_corner_pixels", spy)
     whole, worn = canvas(X), canvas(X)
@@ -133,17 +133,32 @@ def test_jacobian_of_the_corner_pixels_equals_finite_differences():
         slope=np.array([0.1, -0.1, 0.1, -0.1]) * 0.3,
         coefficient=np.array([[0.1, 0.05, 0.02]] * 4),
     )
-    channel = np.random.default_rng(0).random((81, 81)).astype(np.float32)
-    planes, frame = np.array([0.02, 0.01, -0.01, 0.97, 0.02, 0.01]), (np.array([40.0, 40.0]), 20.0)
+    images = mut.Images.of([np.random.default_rng(0).random((81, 81)).astype(np.float32)])
+    planes = np.array([[0.02, 0.01, -0.01, 0.97, 0.02, 0.01]])
+    frame, variance, wanted = (np.array([[40.0, 40.0]]), np.array([20.0])), np.array([1e4]), np.array([True])
     ends = np.rint(mut._corners(curves))
 
     def pixels(d):
         shift = d[6:18].reshape(4, 3) * (curves.inward / curves.cosine())[:, None]
         moved = mut.dc.replace(curves, coefficient=curves.coefficient + shift)
-        return mut._corner_pixels(channel, moved, ends, planes + d[:6], 0.8 + d[18], frame, 1e4)
+        light, blur = planes + d[:6], np.array([0.8 + d[18]])
+        return mut._corner_pixels(images, moved, ends, light, blur, frame, variance, wanted)
 
-    J, _ = pixels(np.zeros(19))
+    J, *_ = pixels(np.zeros(19))
     assert len(J) > 60
     e = 1e-5
     numeric = np.stack([(pixels(-e * d)[1] - pixels(e * d)[1]) / (2 * e) for d in np.eye(19)], -1)
     np.testing.assert_allclose(J, numeric, atol=6e-3 * np.abs(numeric).max())
+
+
+def test_two_quadrilaterals_in_one_pass_are_fitted_as_each_alone():
+    rng, near, far = np.random.default_rng(4), pose(0.7), pose(1.6)
+    images = [canvas(X).finish(rng, 2.0) for X in (near, far)]
+    plain = np.full_like(images[0], 90)
+    corners = [EYE.project(true_corners(X)) for X in (near, far)]
+    both = fit_quads([images[0], plain, images[1]], [corners[0], *corners], LineFittingConfig())
+    assert both[1].reason
+    for X, image, one in zip((near, far), images, (both[0], both[2])):
+        alone = fit(image, X)
+        np.testing.assert_allclose(one.together, alone.together, atol=1e-3)  # each pass stops once all are near
+        np.testing.assert_allclose(one.information, alone.information, rtol=1e-3, atol=1e-3 * alone.information.max())

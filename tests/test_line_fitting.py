@@ -138,12 +138,12 @@ def test_something_straight_across_the_marker_is_not_taken_for_a_shadow():
     mask = np.zeros((480, 640), np.uint8)
     cv2.fillConvexPoly(mask, true_quad(X).round().astype(np.int32), 255)
     image = canvas.finish(np.random.default_rng(0), 2.0).astype(np.float32)
-    assert _even_light(image, mask) is image
+    assert _even_light(image, image, mask, 1)[0] is image
     canvas = Canvas(HEAD.left)
     draw_bar(canvas, X, MARKER)
     canvas.shade(X, 0.3, 2.0)
     image = canvas.finish(np.random.default_rng(0), 2.0).astype(np.float32)
-    even = _even_light(image, mask)
+    even, _ = _even_light(image, image, mask, 1)
     inside = cv2.erode(mask, np.ones((9, 9))) > 0
     assert image[inside][:, 0].std() > 50 and even[inside][:, 0].std() < 8
 

@@ -5,6 +5,7 @@
 
 import contextlib
 import dataclasses as dc
+import functools
 import gc
 import importlib.metadata
 import json
@@ -244,8 +245,8 @@ def _advance(
 
 
 def _in_real_time(simulator: Simulator, pacer: Pacer, sink: Sink) -> Callable[[float], None]:
-    """AdvanceTo, held to the wall's clock tick by tick: first from the station's being read to the commands, which leave
-    as slot 3 begins; then, with nobody waiting, slot 3 itself."""
+    """AdvanceTo, held to the wall's clock tick by tick: from the station's being read to the commands, which leave as
+    slot 3 begins; then, with nobody waiting, slot 3 itself."""
     gc.collect()
     gc.freeze()  # what is there stays: a collection that looks at it all would take several ticks
     context = simulator.get_context()
@@ -253,9 +254,8 @@ def _in_real_time(simulator: Simulator, pacer: Pacer, sink: Sink) -> Callable[[f
     def go(until: float) -> None:
         while True:
             tick = int(context.get_time() / TICK + 1 / 4) * TICK
-            pacer.tick(
-                lambda at=tick: simulator.AdvanceTo(at + 3 * SLOT), lambda at=tick: simulator.AdvanceTo(at + 3.25 * SLOT)
-            )
+            commands, rest = (functools.partial(simulator.AdvanceTo, tick + n * SLOT) for n in (3, 3.25))
+            pacer.tick(commands, rest)
             now = context.get_time()
             if int(tick) != int(tick + TICK):
                 sink.write(PACE, pacer.report(now), now)

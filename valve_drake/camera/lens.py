@@ -75,19 +75,22 @@ class Lens:
         return self._corrected_jacobian(px - np.array([self.u_0, self.v_0])) / np.array([[self.k_x], [self.k_y]])
 
     def project(self, xy: np.ndarray) -> np.ndarray:
-        k = np.array([self.k_u, self.k_v])
-        target = xy * np.array([self.k_x, self.k_y])
-        d = target / (1 + k * (target * target).sum(-1)[..., None])
+        # Eq. (1) has one unknown, r^2: with it, u - u_0 = (u' - u_0) / (1 + k_u r^2), and v likewise.
+        u, v = self.k_x * xy[..., 0], self.k_y * xy[..., 1]
+        uu, vv = u * u, v * v
+        rr = uu + vv
+        rr = rr / ((1 + self.k_u * rr) * (1 + self.k_v * rr))
         for _ in range(_NEWTON_STEPS):
-            miss = d * (1 + k * (d * d).sum(-1)[..., None]) - target
-            if np.abs(miss).max(initial=0.0) < 1e-11:
+            by_u, by_v = 1 + self.k_u * rr, 1 + self.k_v * rr
+            of_u, of_v = uu / (by_u * by_u), vv / (by_v * by_v)
+            slope = 1 + 2 * (self.k_u * of_u / by_u + self.k_v * of_v / by_v)
+            step = (of_u + of_v - rr) / slope
+            rr = rr + step
+            if np.abs(step).max(initial=0.0) < 1e-6:  # the next one would be its square
                 break
-            J = self._corrected_jacobian(d)
-            det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-            su = (J[..., 1, 1] * miss[..., 0] - J[..., 0, 1] * miss[..., 1]) / det
-            sv = (J[..., 0, 0] * miss[..., 1] - J[..., 1, 0] * miss[..., 0]) / det
-            d = d - np.stack([su, sv], -1)
-        return d + np.array([self.u_0, self.v_0])
+        out = np.empty(np.shape(xy))
+        out[..., 0], out[..., 1] = u / (1 + self.k_u * rr) + self.u_0, v / (1 + self.k_v * rr) + self.v_0
+        return out
 
     def focal(self) -> float:
         return float(np.sqrt(self.k_x * self.k_y))

@@ -52,7 +52,8 @@ def estimate_rectangle(
             raise ValueError(
                 f"{camera} image must be {lens.width} x {lens.height} RGB uint8, got {image.shape} {image.dtype}"
             )
-        seen.append(segmented(CameraFrame(camera=camera, image=np.array(image)), segmentation))
+        # A view: the frame makes what it holds read-only, and the caller's array is not ours to lock.
+        seen.append(segmented(CameraFrame(camera=camera, image=image.view()), segmentation))
     pair = SegmentationPair(left=seen[0], right=seen[1])
     return estimate(fit_pair(pair, head, marker, lines, matching), head, marker, estimator, track)
 

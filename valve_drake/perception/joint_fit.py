@@ -20,7 +20,6 @@ import numpy as np
 from valve_drake.perception.marker import NEXT
 
 _BEFORE = np.array([3, 0, 1, 2])
-_MEETING = np.array([0, 1, 2, 3, 3, 0, 1, 2])
 NODES = (1 - 1 / np.sqrt(3)) / 2, (1 + 1 / np.sqrt(3)) / 2  # of a side's length, from its first corner
 # A side's own unknowns: two levels outside, two of the step, its shift, turn and bend, the blur. Common unknowns:
 # plane outside (3), plane of the step (3), four shifts (3 each), the blur; _COMMON (4, 8, 19) makes a side's of them.
@@ -43,6 +42,30 @@ PRIOR_POINTS = 20  # how many points the noise of the grey values counts for, ag
 
 
 @dc.dataclass(frozen=True)
+class Images:
+    """Q channels in one array: pixel (u, v) of channel q is pixels[origin[q] + wide[q] v + u]."""
+
+    pixels: np.ndarray  # (n,) float32
+    origin: np.ndarray  # (Q,)
+    wide: np.ndarray  # (Q,) [px]
+    tall: np.ndarray  # (Q,) [px]
+
+    @classmethod
+    def of(cls, channels: list[np.ndarray]) -> "Images":
+        """channels: (H, W) float32 each."""
+        size = np.array([channel.size for channel in channels])
+        return cls(
+            pixels=np.concatenate([channel.ravel() for channel in channels]),
+            origin=np.cumsum(size) - size,
+            wide=np.array([channel.shape[1] for channel in channels]),
+            tall=np.array([channel.shape[0] for channel in channels]),
+        )
+
+    def __getitem__(self, own: np.ndarray) -> "Images":
+        return Images(self.pixels, self.origin[own], self.wide[own], self.tall[own])
+
+
+@dc.dataclass(frozen=True)
 class Curves:
     """Sides as curves in one image: position across = start + slope t + basis(tau) . coefficient."""
 
@@ -54,7 +77,7 @@ class Curves:
     slope: np.ndarray  # (S,)
     coefficient: np.ndarray  # (S, 3)
 
-    def __getitem__(self, own: slice | np.ndarray) -> "Curves":
+    def __getitem__(self, own: np.ndarray) -> "Curves":
         return Curves(*(getattr(self, field.name)[own] for field in dc.fields(self)))
 
     def cosine(self) -> np.ndarray:
@@ -99,7 +122,7 @@ class Sums:
     square: np.ndarray  # (S,) of the residuals
     pixels: np.ndarray  # (S,)
 
-    def __getitem__(self, own: slice) -> "Sums":
+    def __getitem__(self, own: np.ndarray) -> "Sums":
         return Sums(*(getattr(self, field.name)[own] for field in dc.fields(self)))
 
 
@@ -114,180 +137,210 @@ def sums(
 ) -> Sums:
     """weight, rise, gain, z, residual: (S, N, M) of each pixel; good, tau (S, N) of each profile."""
     S, N, M = weight.shape
-    values = np.empty((S, 9, N, M), np.float32)  # the eight functions of a side, and the residual
-    values[:, 0], values[:, 2], values[:, 8] = 1, rise, residual
-    values[:, 1] = by_tau = np.broadcast_to(tau.astype(np.float32)[:, :, None], weight.shape).copy()
-    np.negative(gain, out=values[:, 4])
-    np.multiply(values[:, 2], by_tau, out=values[:, 3])
-    np.multiply(values[:, 4], by_tau, out=values[:, 5])
+    values = np.empty((S, 9, N, M), np.float32)  # the eight functions of a side, and the residual, by the weight's root
+    root = values[:, 0]
+    weight = weight * good.astype(np.float32)[:, :, None]
+    np.sqrt(weight, out=root)
+    for k, function in ((2, rise), (4, -gain), (8, residual)):
+        np.multiply(function, root, out=values[:, k])
+    by_tau = tau.astype(np.float32)[:, :, None]
+    np.multiply(values[:, :6:2], by_tau[:, None], out=values[:, 1:6:2])
     np.multiply(values[:, 4], by_tau * by_tau - np.float32(1 / 3), out=values[:, 6])
     np.multiply(values[:, 4], z, out=values[:, 7])
-    weighted = values * (weight * good.astype(np.float32)[:, :, None])[:, None]
-    products = (weighted.reshape(S, 9, -1) @ values.reshape(S, 9, -1).transpose(0, 2, 1)).astype(float)
+    values = values.reshape(S, 9, -1)
+    # All but the first with itself: BLAS takes four times as long for a matrix by its own transpose.
+    products = np.empty((S, 9, 9))
+    products[:, 1:] = values[:, 1:] @ values.transpose(0, 2, 1)
+    products[:, 0, 1:] = products[:, 1:, 0]
+    products[:, 0, 0] = weight.sum((1, 2), dtype=float)
     return Sums(
-        normal=products[:, :8, :8],
-        right=products[:, :8, 8],
-        square=products[:, 8, 8],
-        pixels=weighted[:, 0].sum((1, 2), dtype=float),
+        normal=products[:, :8, :8], right=products[:, :8, 8], square=products[:, 8, 8], pixels=products[:, 0, 0]
     )
 
 
 def joint_fit(
-    channel: np.ndarray,
+    images: Images,
     curves: Curves,
     level: np.ndarray,
-    blur: float,
+    blur: np.ndarray,
     seen: Sums,
     bend: np.ndarray,
-    scatter: tuple[float, float],
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Points (4, n, 2) [px] spread evenly on the sides, through which straight lines go once they are undistorted; and
-    the information (8, 8) [1/px^2] of the distances inward of the sides at NODES.
+    scatter: np.ndarray,
+) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """For each of Q quadrilaterals, all in one pass: points (4, n, 2) [px] spread evenly on the sides, through which
+    straight lines go once they are undistorted; and the information (8, 8) [1/px^2] of the distances inward of the
+    sides at NODES.
 
-    channel (H, W); curves of the four sides, level (4, 4) their own levels; seen, bend (4,): prior on each bend;
-    scatter: chi^2 of the edge points about their sides times sigma^2, and its degrees of freedom. None where the
-    light is not that of two planes, there are too few pixels to tell, or the sides do not meet.
+    images of the Q channels; curves of their 4 Q sides, level (4 Q, 4) the sides' own levels; blur (Q,); seen,
+    bend (4 Q,): prior on each bend; scatter (Q, 2): chi^2 of the edge points about their sides times sigma^2, and its
+    degrees of freedom. None where the light is not that of two planes, there are too few pixels to tell, or the sides
+    do not meet.
     """
+    Q = len(blur)
     middle = curves.points(curves.first[:, None] + (curves.count[:, None] - 1) * np.array([0.0, 0.5, 1.0]))
-    halves = middle[:, 1]
-    centre, size = halves.sum(0) / 4, (halves.max(0) - halves.min(0)).max()
-    place = (middle - centre) / size
-    T = _COMMON.copy()
-    T[:, 0, 1:3] = T[:, 2, 4:6] = place[:, 1]
-    T[:, 1, 1:3] = T[:, 3, 4:6] = (place[:, 2] - place[:, 0]) / 2
-    to_levels = T[:, _LEVELS, :6].reshape(16, 6)
-    planes = np.linalg.solve(to_levels.T @ to_levels, to_levels.T @ level.ravel())
-    off = np.zeros((4, 8))
-    off[:, _LEVELS] = level - (to_levels @ planes).reshape(4, 4)
-    right = seen.right + (seen.normal @ off[:, :, None])[..., 0]
-    flat_T = T.reshape(32, 19)
-    H = flat_T.T @ (seen.normal @ T).reshape(32, 19)
-    H[_BENDS, _BENDS] += bend
-    b = flat_T.T @ right.ravel()
+    halves = middle[:, 1].reshape(Q, 4, 2)
+    centre, size = halves.sum(1) / 4, (halves.max(1) - halves.min(1)).max(1)
+    place = (middle.reshape(Q, 4, 3, 2) - centre[:, None, None]) / size[:, None, None, None]
+    T = np.empty((Q, *_COMMON.shape))
+    T[:] = _COMMON
+    T[:, :, 0, 1:3] = T[:, :, 2, 4:6] = place[:, :, 1]
+    T[:, :, 1, 1:3] = T[:, :, 3, 4:6] = (place[:, :, 2] - place[:, :, 0]) / 2
+    to_levels = T[:, :, _LEVELS, :6].reshape(Q, 16, 6)
+    back = to_levels.transpose(0, 2, 1)
+    planes = np.linalg.solve(back @ to_levels, back @ level.reshape(Q, 16, 1))
+    off = np.zeros((4 * Q, 8, 1))
+    off[:, _LEVELS] = level[:, :, None] - (to_levels @ planes).reshape(4 * Q, 4, 1)
+    planes = planes[:, :, 0]
+    right = seen.right + (seen.normal @ off)[:, :, 0]
+    flat_T = T.reshape(Q, 32, 19)
+    back = flat_T.transpose(0, 2, 1)
+    H = back @ (seen.normal.reshape(Q, 4, 8, 8) @ T).reshape(Q, 32, 19)
+    H[:, _BENDS, _BENDS] += bend.reshape(Q, 4)
+    b = back @ right.reshape(Q, 32, 1)
     step = np.linalg.solve(H, b)
-    lost = float((off * (seen.right + right)).sum() - b @ step)
+    lost = (off[:, :, 0] * (seen.right + right)).reshape(Q, 32).sum(1) - (b * step).sum((1, 2))
+    step = step[:, :, 0]
 
     apart = _apart(seen, bend)
-    freedom = float(seen.pixels.sum()) - 29
-    if freedom < 30:
-        return None
-    variance = (float(seen.square.sum()) + apart) / freedom
-    if not 0 < lost - apart < 10 * _UNEVEN * variance:
-        return None
+    freedom = seen.pixels.reshape(Q, 4).sum(1) - 29
+    variance = (seen.square.reshape(Q, 4).sum(1) + apart) / np.maximum(freedom, 1)
+    fits = (freedom >= 30) & (lost > apart) & (lost - apart < 10 * _UNEVEN * variance)
 
     per_shift = (curves.inward / curves.cosine())[:, None]
 
     def moved(step: np.ndarray) -> Curves:
-        shift = step[6:18].reshape(4, 3) * per_shift
-        return dc.replace(curves, coefficient=curves.coefficient + shift)
+        return dc.replace(curves, coefficient=curves.coefficient + step[:, 6:18].reshape(4 * Q, 3) * per_shift)
 
-    ends = _corners(moved(step))
-    if not np.isfinite(ends).all():
-        return None
-    if ((ends[NEXT] - ends) ** 2).sum(1).min() > _SHORT**2:
-        J, r = _corner_pixels(channel, moved(step), ends, planes + step[:6], blur + step[18], (centre, size), variance)
-        H = H + J.T @ J
-        step = step + np.linalg.solve(H, J.T @ r)
     final = moved(step)
     ends = _corners(final)
-    starts, stops = (np.where(final.flat, p[:, 0], p[:, 1]) for p in (ends, ends[NEXT]))
-    t = starts[:, None] + (stops - starts)[:, None] * np.array(NODES)
-    K = np.zeros((8, 19))
-    K[_ROWS, _ROWS // 2 * 3 + 6], K[_ROWS, _ROWS // 2 * 3 + 7] = 1, final.tau(t).ravel()  # undistorted, none has a bend
-    chi2, n = scatter
-    spread = (chi2 / variance + PRIOR_POINTS) / (n + PRIOR_POINTS)
-    covariance = variance * spread * (K @ np.linalg.solve(H, K.T))
-    even = curves.first[:, None] + (curves.count[:, None] - 1) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    return final.points(even), np.linalg.inv(covariance)
+    fits &= np.isfinite(ends).all((1, 2))
+    long = fits & (((ends[:, NEXT] - ends) ** 2).sum(2).min(1) > _SHORT**2)
+    if long.any():
+        light = planes + step[:, :6]
+        J, r, owner = _corner_pixels(images, final, ends, light, blur + step[:, 18], (centre, size), variance, long)
+        for q in np.flatnonzero(long):
+            own = J[owner == q]
+            H[q] += own.T @ own
+            step[q] += np.linalg.solve(H[q], own.T @ r[owner == q])
+        final = moved(step)
+        ends = _corners(final)
+    begin, stop = ends.reshape(-1, 2), ends[:, NEXT].reshape(-1, 2)
+    begin, stop = (np.where(final.flat, p[:, 0], p[:, 1]) for p in (begin, stop))
+    t = begin[:, None] + (stop - begin)[:, None] * np.array(NODES)
+    K = np.zeros((Q, 8, 19))  # undistorted, none has a bend
+    K[:, _ROWS, _ROWS // 2 * 3 + 6], K[:, _ROWS, _ROWS // 2 * 3 + 7] = 1, final.tau(t).reshape(Q, 8)
+    even = final.points(curves.first[:, None] + (curves.count[:, None] - 1) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES)
+    out: list[tuple[np.ndarray, np.ndarray] | None] = [None] * Q
+    for q in np.flatnonzero(fits):
+        chi2, n = scatter[q]
+        spread = (chi2 / variance[q] + PRIOR_POINTS) / (n + PRIOR_POINTS)
+        covariance = variance[q] * spread * (K[q] @ np.linalg.solve(H[q], K[q].T))
+        out[q] = even[4 * q : 4 * q + 4], np.linalg.inv(covariance)
+    return out
 
 
-def _apart(seen: Sums, bend: np.ndarray) -> float:
-    """By how much the sum of squares falls if every side has its own levels (negative)."""
+def _apart(seen: Sums, bend: np.ndarray) -> np.ndarray:
+    """By how much each quadrilateral's sum of squares falls if every side has its own levels (Q,), negative."""
     own = np.arange(7)
     N = seen.normal[:, :7, :7].copy()
     N[:, own, own] += 1e-9
     N[:, 6, 6] += bend
-    both = np.stack([seen.right[:, :7], seen.normal[:, :7, _BLUR]], -1)
-    reduced = np.linalg.solve(N, both)
-    fall = (both[..., 0] * reduced[..., 0]).sum()
-    g = (seen.right[:, _BLUR] - (both[..., 1] * reduced[..., 0]).sum(-1)).sum()
-    h = (seen.normal[:, _BLUR, _BLUR] - (both[..., 1] * reduced[..., 1]).sum(-1)).sum()
-    return -float(fall + g * g / h)
+    both = np.empty((len(bend), 7, 2))
+    both[:, :, 0], both[:, :, 1] = seen.right[:, :7], seen.normal[:, :7, _BLUR]
+    products = both.transpose(0, 2, 1) @ np.linalg.solve(N, both)
+    fall = products[:, 0, 0].reshape(-1, 4).sum(1)
+    g = (seen.right[:, _BLUR] - products[:, 1, 0]).reshape(-1, 4).sum(1)
+    h = (seen.normal[:, _BLUR, _BLUR] - products[:, 1, 1]).reshape(-1, 4).sum(1)
+    return -(fall + g * g / h)
 
 
 def _corners(curves: Curves) -> np.ndarray:
-    """Where the sides meet, (4, 2) [px]."""
+    """Where the sides of Q quadrilaterals meet, (Q, 4, 2) [px]."""
     ends = curves.points(curves.first[:, None] + (curves.count[:, None] - 1) * np.array([0.0, 1.0]))
     d = ends[:, 1] - ends[:, 0]
-    lines = np.empty((4, 3))
+    lines = np.empty((len(d), 3))
     lines[:, 0], lines[:, 1] = -d[:, 1], d[:, 0]
     lines[:, 2] = -(lines[:, :2] * ends[:, 0]).sum(1)
-    return meet(lines)
+    return meet(lines.reshape(-1, 4, 3))
 
 
 def meet(lines: np.ndarray) -> np.ndarray:
-    """Corners (4, 2) of four sides (4, 3): corner k is where sides k - 1 and k meet."""
-    a, b = lines[_BEFORE], lines
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    out = np.empty((4, 2))
-    out[:, 0], out[:, 1] = ay * bz - az * by, az * bx - ax * bz
-    with np.errstate(divide="ignore", invalid="ignore"):
-        out /= (ax * by - ay * bx)[:, None]
+    """Corners (..., 4, 2) of four sides (..., 4, 3): corner k is where sides k - 1 and k meet, NaN if they do not."""
+    x, y, z = lines[..., 0], lines[..., 1], lines[..., 2]
+    ax, ay, az = x[..., _BEFORE], y[..., _BEFORE], z[..., _BEFORE]
+    det = ax * y - ay * x
+    det = np.where(det == 0, np.nan, det)
+    out = np.empty((*det.shape, 2))
+    out[..., 0], out[..., 1] = (ay * z - az * y) / det, (az * x - ax * z) / det
     return out
 
 
 def _corner_pixels(
-    channel: np.ndarray,
+    images: Images,
     curves: Curves,
     ends: np.ndarray,
     planes: np.ndarray,
-    blur: float,
-    frame: tuple[np.ndarray, float],
-    variance: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobian (n, 19) and residual (n,) of the pixels at the corners that no profile holds."""
-    px = np.rint(ends).astype(int)[:, None] + _SQUARE  # (4, n, 2)
-    sides = curves[_MEETING]  # those that begin at the corners, then those that end there
+    blur: np.ndarray,
+    frame: tuple[np.ndarray, np.ndarray],
+    variance: np.ndarray,
+    wanted: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Jacobian (n, 19) and residual (n,) of the pixels at the corners that no profile holds, and whose they are (n,).
+
+    wanted (Q,): the quadrilaterals whose pixels are looked for.
+    """
+    Q = len(ends)
+    quads = np.flatnonzero(wanted)
+    corners = (4 * quads[:, None] + np.arange(4)).ravel()  # numbers among all 4 Q
+    before = (4 * quads[:, None] + _BEFORE).ravel()
+    C = len(corners)
+    px = np.rint(ends.reshape(4 * Q, 2)[corners]).astype(int)[:, None] + _SQUARE  # (C, n, 2)
+    sides = curves[np.concatenate([corners, before])]  # those that begin at the corners, then those that end there
     flat, first = sides.flat[:, None], sides.first[:, None]
     u, v = np.concatenate([px, px]).transpose(2, 0, 1)
-    t, y = np.where(flat, u, v), np.where(flat, v, u)  # (8, n)
+    t, y = np.where(flat, u, v), np.where(flat, v, u)  # (2 C, n)
     gap = (y - sides.across(t)) * (sides.inward * sides.cosine())[:, None]
     beyond = (t < first) | (t >= first + sides.count[:, None])
-    near, far = np.minimum(gap[:4], gap[4:]), np.maximum(gap[:4], gap[4:])
-    u, v = u[:4], v[:4]
-    keep = (u >= 0) & (v >= 0) & (u < channel.shape[1]) & (v < channel.shape[0])
-    keep &= beyond[:4] & beyond[4:] & (near > -_OUTSIDE) & (far > -1) & (near < 4)
+    near, far = np.minimum(gap[:C], gap[C:]), np.maximum(gap[:C], gap[C:])
+    u, v = u[:C], v[:C]
+    of = corners // 4
+    keep = (u >= 0) & (v >= 0) & (u < images.wide[of, None]) & (v < images.tall[of, None])
+    keep &= beyond[:C] & beyond[C:] & (near > -_OUTSIDE) & (far > -1) & (near < 4)
     kept = np.flatnonzero(keep)
-    corner = kept // len(_SQUARE)
+    row = kept // len(_SQUARE)
+    corner, behind = corners[row], before[row]
+    q = of[row]
     px = px.reshape(-1, 2)[kept]
-    b, a = gap.reshape(2, -1)[:, kept] / blur
+    b, a = gap.reshape(2, -1)[:, kept] / blur[q]
     along = basis(sides.tau(t).reshape(2, -1)[:, kept])
     normals = curves.normals()
-    rho = (normals[_BEFORE] * normals).sum(1)[corner]
+    rho = (normals[behind] * normals[corner]).sum(1)
     cover, by_a, by_b = _wedge(a, b, rho)
 
     n = len(px)
     place = np.empty((n, 3))
     place[:, 0] = 1
-    place[:, 1:] = (px - frame[0]) / frame[1]
-    height = place @ planes[3:]
+    place[:, 1:] = (px - frame[0][q]) / frame[1][q, None]
+    light = planes[q]
+    height = (place * light[:, 3:]).sum(1)
     J = np.zeros((n, 19))
     J[:, :3] = place
     np.multiply(place, cover[:, None], out=J[:, 3:6])
-    scaled = height / -blur
+    scaled = height / -blur[q]
     shifts = np.zeros((n, 4, 3))
     rows = np.arange(n)
-    for values, slope, side in ((along[0], by_b, corner), (along[1], by_a, _BEFORE[corner])):
+    for values, slope, side in ((along[0], by_b, corner % 4), (along[1], by_a, behind % 4)):
         shifts[rows, side] = (scaled * slope)[:, None] * values
     J[:, 6:18] = shifts.reshape(n, 12)
     J[:, 18] = scaled * (a * by_a + b * by_b)
-    r = channel[px[:, 1], px[:, 0]] - place @ planes[:3] - height * cover
-    chi2 = r * r / variance
+    value = images.pixels[images.origin[q] + px[:, 1] * images.wide[q] + px[:, 0]]
+    r = value - (place * light[:, :3]).sum(1) - height * cover
+    chi2 = r * r / variance[q]
     good = chi2 < _CUT**2
-    n = np.bincount(corner, good, 4)
-    mean = np.bincount(corner, good * chi2, 4) / np.maximum(n, 1)
-    good &= ((mean < _POOR) & (n > 0.9 * np.bincount(corner, minlength=4)))[corner]
-    return J[good], r[good]
+    n = np.bincount(row, good, C)
+    mean = np.bincount(row, good * chi2, C) / np.maximum(n, 1)
+    good &= ((mean < _POOR) & (n > 0.9 * np.bincount(row, minlength=C)))[row]
+    return J[good], r[good], q[good]
 
 
 def _wedge(a: np.ndarray, b: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

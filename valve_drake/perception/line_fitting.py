@@ -22,8 +22,8 @@ import numpy as np
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require_in
 from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, SegmentationPair
-from valve_drake.perception.color_segmentation import polygon_area
-from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, basis, joint_fit, meet, normal_cdf, sums
+from valve_drake.perception.color_segmentation import every, polygon_area
+from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, Images, basis, joint_fit, meet, normal_cdf, sums
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig, match, single, wrong_size
 
@@ -32,7 +32,7 @@ _LEVEL_PRIOR = np.diag([1e-9, 0.1, 1e-9, 0.1, 1e-6, 1e-6])
 _FOUR = np.arange(4)
 _REACH = 4.5  # half a profile's length that holds a blurred step [blur]
 _PAD = 12  # least room round the quadrilateral [px]
-_LARGE = 100  # of a quadrilateral of this size coarse lines are looked for at half resolution [px]
+_LARGE = 100  # of a quadrilateral of this size colours and coarse lines are looked for at half resolution [px]
 _EVEN = 0.1  # deviation over mean of the marker's inside above which a shadow is looked for
 _ONE_HUE = 0.96  # least cosine between the marker's colour in the shadow and in the light
 _TWO_LEVELS = 0.25  # share of that variance which two lights leave unexplained at most
@@ -122,17 +122,20 @@ def _edges_of(
     if raw.reason:
         return QuadEdges(reason=raw.reason, center_px=candidate.center)
     n = len(raw.points)
-    both = raw.points if raw.together is None else np.concatenate([raw.points, raw.together.reshape(-1, 2)])
-    points = lens.normalize(both)
-    lines, scatter = side_lines(points[:n], raw.side)
-    if raw.together is not None:
+    if raw.together is None:
+        points = lens.normalize(raw.points)
+        lines, off = side_lines(points, raw.side)
+        scatter = off * lens.focal()
+    else:
         on_each = raw.together.shape[1]
-        lines = side_lines(points[n:], np.arange(4 * on_each) // on_each)[0]
+        points = lens.normalize(np.concatenate([raw.points, raw.together.reshape(-1, 2)]))
+        lines, off = side_lines(points[n:], np.arange(4 * on_each) // on_each)
+        scatter = math.hypot(off * lens.focal(), raw.sigma)  # these are on the curves that the points scatter about
     corners = meet(lines)
     if not np.isfinite(corners).all():
         return QuadEdges(reason="sides do not meet", center_px=candidate.center)
-    if scatter * lens.focal() > max_sigma:
-        return QuadEdges(reason=f"sides not straight: {scatter * lens.focal():.2f} px", center_px=candidate.center)
+    if scatter > max_sigma:
+        return QuadEdges(reason=f"sides not straight: {scatter:.2f} px", center_px=candidate.center)
     return QuadEdges(
         found=True,
         points=points[:n],
@@ -206,22 +209,24 @@ def side_lines(points: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]
 
 def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tuple[np.ndarray, float]:
     """One linear channel, float32: about 1 inside, about 0 outside; and the contrast it has [grey levels]."""
+    step = _step(corners)
+    small, corners = every(part, step), corners / step
     if config.gamma != 1.0:
         table = (255 * (np.arange(256) / 255) ** config.gamma).astype(np.float32)
-        part = table[part]
+        part, small = table[part], table[small]
     else:
-        part = part.astype(np.float32)
+        part, small = part.astype(np.float32), small.astype(np.float32)
     middle = corners.mean(0)
 
     def grown(factor: float) -> np.ndarray:
-        mask = np.zeros(part.shape[:2], np.uint8)
+        mask = np.zeros(small.shape[:2], np.uint8)
         shape = ((middle + factor * (corners - middle)) * 16).round().astype(np.int32)
         return cv2.fillConvexPoly(mask, shape, 255, shift=4)
 
     inside = grown(0.75)
-    part = _even_light(part, inside)
-    core = np.array(cv2.mean(part, inside)[:3])
-    ring = np.array(cv2.mean(part, cv2.subtract(grown(1.3), grown(1.14)))[:3])
+    part, small = _even_light(part, small, inside, step)
+    core = np.array(cv2.mean(small, inside)[:3])
+    ring = np.array(cv2.mean(small, cv2.subtract(grown(1.3), grown(1.14)))[:3])
     difference = core - ring
     if config.color_only:
         difference = difference - difference.mean()
@@ -232,17 +237,23 @@ def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tu
     return cv2.transform(part, np.array([[*w, -w @ ring]], np.float32)), contrast
 
 
-def _even_light(part: np.ndarray, inside: np.ndarray) -> np.ndarray:
+def _step(corners: np.ndarray) -> int:
+    return 2 if np.ptp(corners, axis=0).max() > _LARGE else 1
+
+
+def _even_light(part: np.ndarray, small: np.ndarray, inside: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
     """The image (H, W, 3) float32 as if all of it were in the light, if a shadow's edge crosses the marker.
 
-    inside: mask of the marker's inside. It is of one colour, so two levels on either side of a straight edge are two
-    lights. The edge is taken to go on straight beyond the marker.
+    small, and what is returned second: every step-th pixel of it; inside: mask of the marker's inside in it. It is of
+    one colour, so two levels on either side of a straight edge are two lights. The edge is taken to go on straight
+    beyond the marker.
     """
-    mean, deviation = (x.ravel() for x in cv2.meanStdDev(part, mask=inside))
+    mean, deviation = (x.ravel() for x in cv2.meanStdDev(small, mask=inside))
     if deviation.max() < _EVEN * mean.max():
-        return part
+        return part, small
     v, u = np.nonzero(inside)
-    colors = part[v, u].astype(float)
+    colors = small[v, u].astype(float)
+    u, v = step * u, step * v
     y = colors @ deviation / deviation.sum()
     middle, size = np.array([u.mean(), v.mean()]), float(np.hypot(u.std(), v.std()))
     form = np.column_stack([(u - middle[0]) / size, (v - middle[1]) / size, np.ones(len(u))])
@@ -265,15 +276,16 @@ def _even_light(part: np.ndarray, inside: np.ndarray) -> np.ndarray:
             damping *= 10
         x = best + np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), g)
     if square > _TWO_LEVELS * len(y) * y.var():
-        return part
+        return part, small
     levels = np.linalg.lstsq(np.column_stack([form[:, 2], np.tanh(form @ best[:3])]), colors, rcond=None)[0]
     one, other = levels[0] + levels[1], levels[0] - levels[1]
     if one @ other < _ONE_HUE * np.linalg.norm(one) * np.linalg.norm(other):
-        return part  # something lies before the marker
+        return part, small  # something lies before the marker
     rows, columns = (np.arange(n)[shape] for n, shape in zip(part.shape, ((..., None), (None, ...))))
     s = np.tanh(((columns - middle[0]) * best[0] + (rows - middle[1]) * best[1]) / size + best[2])
     lit = np.maximum(one, other)
-    return (part / np.clip((levels[0] + levels[1] * s[..., None]) / lit, 0.1, 1)).astype(np.float32)
+    part = (part / np.clip((levels[0] + levels[1] * s[..., None]) / lit, 0.1, 1)).astype(np.float32)
+    return part, every(part, step)
 
 
 def _hough_corners(channel: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -281,10 +293,9 @@ def _hough_corners(channel: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
     A side without such a line (a wide-angle lens bends long ones) starts from its coarse one.
     """
-    step = 2 if np.ptp(corners, axis=0).max() > _LARGE else 1
-    coarse, channel = corners, np.ascontiguousarray(channel[::step, ::step])
-    corners = corners / step
-    gray = cv2.convertScaleAbs(cv2.max(cv2.min(channel, 1.0), 0.0), alpha=255)
+    step = _step(corners)
+    coarse, corners, channel = corners, corners / step, every(channel, step)
+    gray = cv2.convertScaleAbs(cv2.max(channel, 0.0), alpha=255)
     edges = cv2.Canny(gray, 60, 120)
     band = np.zeros(edges.shape, np.uint8)
     cv2.polylines(band, [(corners * 16).round().astype(np.int32)], True, 255, 7, shift=4)
@@ -292,7 +303,7 @@ def _hough_corners(channel: np.ndarray, corners: np.ndarray) -> np.ndarray:
     along = ends - corners
     lengths = np.sqrt((along * along).sum(1))
     votes = max(int(0.35 * lengths.min()), 4)
-    turn = min(max(2 / lengths.max(), np.pi / 180), np.pi / 90)  # a pixel at the ends of a side
+    turn = min(max(4 / lengths.max(), np.pi / 180), np.pi / 45)  # a pixel either way at the ends of a side
     edges = cv2.bitwise_and(edges, band)
     found = cv2.HoughLines(edges, 1.0, turn, votes)
     direction = along / lengths[:, None]
@@ -372,21 +383,20 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         for name in ("flat", "first", "count", "start", "slope", "inward")
     )
     half = np.repeat([float(q.half) for q in quads], 4)
-    tall, wide = (np.repeat([q.channel.shape[k] for q in quads], 4) for k in (0, 1))
-    pixels = np.concatenate([q.channel.ravel() for q in quads])
-    origin = np.repeat(np.cumsum([0] + [q.channel.size for q in quads[:-1]]), 4)
+    images = Images.of([q.channel for q in quads])
+    origin, wide, tall = (np.repeat(a, 4) for a in (images.origin, images.wide, images.tall))
     # Pixel (t, y) of a side is pixels[origin + by_t t + by_y y].
     by_t, by_y = np.where(flat, 1, wide)[:, None], np.where(flat, wide, 1)[:, None, None]
     by_y = by_y.astype(np.int32)
     last_t, last_y = np.where(flat, wide, tall)[:, None] - 1, np.where(flat, tall, wide)[:, None, None] - 1
     last_y = last_y.astype(np.int32)
     cosine = 1 / np.sqrt(1 + slope**2)
-    reach = int(half.max()) + 2
+    reach = int(half.max()) + 1
     across = np.arange(-reach, reach + 1, dtype=np.int32)
     across_32 = across.astype(np.float32)
 
     def profiles(k: np.ndarray) -> tuple:
-        """Those with numbers k on each side: all that the fit needs of them."""
+        """Those with numbers k on each side, about what is known of it so far: all that the fit needs of them."""
         t = first[:, None] + k  # (S, N)
         used = k < count[:, None]
         tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1 along each side
@@ -394,20 +404,21 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         room = half[:, None] - np.maximum(half[:, None] - _LEAST_HALF - from_end / _LEAN, 0)
         room = (room + 1).astype(np.float32)[:, :, None]  # (S, N, 1)
         line = start[:, None] + slope[:, None] * t
-        middle = np.rint(line)
+        powers = basis(tau)
+        middle = np.rint(line + (powers @ coefficient[:, :, None])[:, :, 0])
         y = middle.astype(np.int32)[:, :, None] + across  # (S, N, M)
         inside = np.minimum(np.maximum(y, 0), last_y)
         valid = (inside == y).astype(np.float32)
         valid *= used[:, :, None]
         inside *= by_y
         inside += (origin[:, None] + by_t * np.minimum(t, last_t)).astype(np.int32)[:, :, None]
-        f = pixels.take(inside)  # float32, as all that is per pixel
-        return t, used.astype(float), tau, room, line, middle, f, valid, basis(tau)
+        f = images.pixels.take(inside)  # float32, as all that is per pixel
+        return t, used.astype(float), tau, room, line, middle, f, valid, powers
 
     # On long sides the way there is found with some of the profiles, and the last step is made with all of them.
     stride = max(int(count.min()) // _ENOUGH, 1)
-    t, used, tau, room, line, middle, f, valid, powers = profiles(np.arange(0, count.max(), stride))
     coefficient = np.zeros((len(count), 3))  # of the sides' deviation from their first straight lines
+    t, used, tau, room, line, middle, f, valid, powers = profiles(np.arange(0, count.max(), stride))
     bend = np.where(count >= 24, 1e-9, 1e9)  # short sides show no curvature of the lens
     good, blur, last = used, np.full(len(count), 1.0), False
     has_step = np.full(len(count), True)
@@ -458,7 +469,8 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
         if last:
             break
         coefficient = coefficient + step
-        settled = np.abs(used * smooth).max() < 0.2 and np.abs(change).max() < 0.05  # the next step is the square of it
+        # The next step is about a tenth of this one, and what it leaves a thousandth: the model is odd about the edge.
+        settled = np.abs(used * smooth).max() < 0.5 and np.abs(change).max() < 0.25
         last = settled or iteration == config.iterations - 2
     edge = curve + moved
     kept = _kept(normal)
@@ -467,7 +479,7 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
     points = np.where(flat[:, None, None], np.stack([t, edge], -1), np.stack([edge, t], -1))
     deviation = good * ((moved - smooth) * cosine[:, None]) ** 2
     predicted = good * typical[:, None] / strength
-    out = []
+    out, scatter = [], []
     for q in range(len(quads)):
         own = slice(4 * q, 4 * q + 4)
         keep = good[own] > 0
@@ -489,21 +501,17 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
             out.append(RawQuad(reason=reason))
             continue
         side = np.repeat(_FOUR, keep.sum(1))
-        scatter = float((deviation * strength)[own].sum()), float(freedom)
-        together, information = None, None
-        if config.together:
-            shared = joint_fit(quads[q].channel, curves[own], level[own], width[4 * q], seen[own], bend[own], scatter)
-            together, information = shared or (None, None)
-        out.append(
-            RawQuad(
-                points=points[own][keep],
-                side=side,
-                sigma=float(sigma),
-                blur=float(blur[4 * q]),
-                together=together,
-                information=information,
-            )
+        scatter.append((float((deviation * strength)[own].sum()), float(freedom)))
+        out.append(RawQuad(points=points[own][keep], side=side, sigma=float(sigma), blur=float(blur[4 * q])))
+    if seen is not None and scatter:
+        fitted = np.array([not raw.reason for raw in out])
+        own = np.repeat(fitted, 4)
+        shared = joint_fit(
+            images[fitted], curves[own], level[own], width[::4][fitted], seen[own], bend[own], np.array(scatter)
         )
+        for q, both in zip(np.flatnonzero(fitted), shared):
+            if both is not None:
+                out[q] = dc.replace(out[q], together=both[0], information=both[1])
     return out
 
 
@@ -526,12 +534,14 @@ def _levels(
     a wrong start for themselves, and the fit would creep. And the normal matrix (S, 6, 6) of all six.
     """
     S, N, M = weight.shape
-    functions = np.empty((S, 7, N, M), np.float32)
-    functions[:, 0], functions[:, 2], functions[:, 4], functions[:, 6] = 1, rise, bell, f
-    functions[:, 1] = tau[:, :, None]
-    np.multiply(functions[:, 2:6:2], functions[:, 1:2], out=functions[:, 3:6:2])
-    weighted = functions[:, :6] * (weight * good.astype(np.float32)[:, :, None])[:, None]
-    products = weighted.reshape(S, 6, -1) @ functions.reshape(S, 7, -1).transpose(0, 2, 1)
+    functions = np.empty((S, 7, N, M), np.float32)  # each times the weight's root
+    root = functions[:, 0]
+    np.sqrt(weight * good.astype(np.float32)[:, :, None], out=root)
+    for k, values in ((2, rise), (4, bell), (6, f)):
+        np.multiply(values, root, out=functions[:, k])
+    np.multiply(functions[:, :6:2], tau.astype(np.float32)[:, None, :, None], out=functions[:, 1:6:2])
+    functions = functions.reshape(S, 7, -1)
+    products = functions[:, :6] @ functions.transpose(0, 2, 1)
     normal = products[:, :, :6] + _LEVEL_PRIOR
     return np.linalg.solve(normal, products[:, :, 6:].astype(float))[:, :4, 0], normal
 

@@ -243,7 +243,7 @@ def _view(
         return "sides do not make a convex quadrilateral in clockwise order"
     # Errors are even in the raw image, not in the ideal one: |A^T n| with A = d xy / d px along the side's normal.
     # It changes by a few percent over an image, so one value for each side will do.
-    A = lens.normalize_jacobian(lens.project((corners + corners[NEXT]) / 2))
+    A = lens.normalize_jacobian((quad.corners_px + quad.corners_px[NEXT]) / 2)
     stretch = np.linalg.norm((lines[:, None, :2] @ A)[:, 0], axis=1)
     return _View(
         X_CL=X_CL,
@@ -523,7 +523,8 @@ def _candidates(
             return fits
         # The mirrored tilt itself, moved to fit, stands for a minimum that it may not have.
         stand_in = dc.replace(fits[0], R=mirrored[0], cost=max(left, fits[0].cost))
-        fits = _distinct(moments, model, [mirrored], config, known=fits)
+        if left <= fits[0].cost + _HOPELESS:
+            fits = _distinct(moments, model, [mirrored], config, known=fits)
         if len(fits) == 1:
             fits.append(stand_in)
     return fits
@@ -541,7 +542,7 @@ def _distinct(
     for R, p in starts:
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
             continue
-        if fits and _moved_to_fit(moments, model, R, p) > fits[0].cost + _HOPELESS:
+        if fits and known is None and _moved_to_fit(moments, model, R, p) > fits[0].cost + _HOPELESS:
             continue
         fit = _refine(moments, model, R, p, 0.0, config, enough=0.05)
         if fit is not None and fit.R[2, 2] > 0:
