@@ -6,7 +6,7 @@ A station is a Diagram: simulated, hardware or replay. Only the simulated one ma
 
 import dataclasses as dc
 
-from pydrake.systems.framework import Diagram, PortDataType
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, PortDataType
 
 from valve_drake.messages import SIDES, CameraFrame, Health
 
@@ -75,3 +75,19 @@ def check_contract(station: Diagram) -> None:
     ]
     if wrong:
         raise TypeError(f"{station.get_name()} breaks the station contract: " + "; ".join(wrong))
+
+
+def station_of(name: str, inputs: LeafSystem, outputs: LeafSystem) -> Diagram:
+    """The station as a Diagram: one system has the contract's input ports under their names, one the output ports."""
+    builder = DiagramBuilder()
+    for system in {id(system): system for system in (outputs, inputs)}.values():
+        builder.AddSystem(system)
+    for spec in CONTRACT:
+        if spec.direction == "in":
+            builder.ExportInput(inputs.GetInputPort(spec.name), spec.name)
+        else:
+            builder.ExportOutput(outputs.GetOutputPort(spec.name), spec.name)
+    station = builder.Build()
+    station.set_name(name)
+    check_contract(station)
+    return station

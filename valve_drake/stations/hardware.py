@@ -24,13 +24,13 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, Diagram, LeafSystem, State
 
 from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.messages import SIDES, CameraFrame, Health
 from valve_drake.ports import SLOT, TICK, profile
 from valve_drake.stations.camera_rig import decode_image
-from valve_drake.stations.contract import CAMERAS, CONTRACT, check_contract
+from valve_drake.stations.contract import CAMERAS, CONTRACT, station_of
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
@@ -440,14 +440,4 @@ class LcmSender(LeafSystem):
 
 def make_hardware_station(link: RobotLink) -> Diagram:
     """The station as a Diagram named `hardware`."""
-    builder = DiagramBuilder()
-    receiver, sender = builder.AddSystem(LcmReceiver(link)), builder.AddSystem(LcmSender(link))
-    for spec in CONTRACT:
-        if spec.direction == "in":
-            builder.ExportInput(sender.GetInputPort(spec.name), spec.name)
-        else:
-            builder.ExportOutput(receiver.GetOutputPort(spec.name), spec.name)
-    station = builder.Build()
-    station.set_name("hardware")
-    check_contract(station)
-    return station
+    return station_of("hardware", inputs=LcmSender(link), outputs=LcmReceiver(link))

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, Diagram, LeafSystem
 
 from valve_drake.checks import ConfigError
 from valve_drake.messages import SIDES, CameraFrame
@@ -33,7 +33,7 @@ from valve_drake.recording.foxglove import NANO, nanoseconds
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.signals import FRAMES, MEASURED, topic_of
 from valve_drake.stations.camera_rig import decode_image
-from valve_drake.stations.contract import CAMERAS, CONTRACT, check_contract
+from valve_drake.stations.contract import CAMERAS, CONTRACT, station_of
 
 JOINTS, HEALTH, OPERATOR = "/joint_states", "/health", "/operator/command"
 WRENCHES = {f"/{side}_wrist/wrench": f"{side}_wrist.wrench" for side in SIDES}
@@ -179,14 +179,5 @@ def _next_tick(time: float) -> float:
 
 def make_replay_station(recording: Recording) -> Diagram:
     """The station as a Diagram named `replay`."""
-    builder = DiagramBuilder()
-    station = builder.AddSystem(RecordedStation(recording))
-    for spec in CONTRACT:
-        if spec.direction == "in":
-            builder.ExportInput(station.GetInputPort(spec.name), spec.name)
-        else:
-            builder.ExportOutput(station.GetOutputPort(spec.name), spec.name)
-    diagram = builder.Build()
-    diagram.set_name("replay")
-    check_contract(diagram)
-    return diagram
+    station = RecordedStation(recording)
+    return station_of("replay", inputs=station, outputs=station)
