@@ -234,6 +234,8 @@ def joint_fit(
     for q in np.flatnonzero(fits):
         chi2, n = scatter[q]
         spread = (chi2 / variance[q] + PRIOR_POINTS) / (n + PRIOR_POINTS)
+        # What pixels know of an edge's place goes with the inverse of its blur, and H is of the blur before the step.
+        spread *= 1 + step[q, 18] / blur[q]
         covariance = variance[q] * spread * (K[q] @ np.linalg.solve(H[q], K[q].T))
         out[q] = even[4 * q : 4 * q + 4], np.linalg.inv(covariance)
     return out

@@ -39,6 +39,7 @@ _TWO_LEVELS = 0.25  # share of that variance which two lights leave unexplained 
 _LEAST_HALF = 2  # half a profile's length at a side's ends, where the light plate is narrowest [px] ...
 _LEAN = 2.5  # ... and the pixels along the side that it needs for one more
 _ENOUGH = 30  # profiles of a side that find the way to its edge
+_SHARP = 0.8  # blur that is looked for first: a lens in focus, and the pixel itself [px]
 
 
 @dc.dataclass
@@ -420,7 +421,7 @@ def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
     coefficient = np.zeros((len(count), 3))  # of the sides' deviation from their first straight lines
     t, used, tau, room, line, middle, f, valid, powers = profiles(np.arange(0, count.max(), stride))
     bend = np.where(count >= 24, 1e-9, 1e9)  # short sides show no curvature of the lens
-    good, blur, last = used, np.full(len(count), 1.0), False
+    good, blur, last = used, np.full(len(count), _SHARP), False
     has_step = np.full(len(count), True)
     for iteration in range(config.iterations):
         if last and stride > 1:
