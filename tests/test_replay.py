@@ -16,6 +16,7 @@ from valve_drake import diagram as wires
 from valve_drake import scenario as scenarios
 from valve_drake.analysis.comparison import Comparison, differences
 from valve_drake.messages import Command, Mode, Status
+from valve_drake.pace import PACE, Pace
 from valve_drake.ports import SLOT, TICK
 from valve_drake.recording import foxglove
 from valve_drake.recording.reader import LogReader, recover
@@ -258,6 +259,19 @@ def test_a_damaged_log_is_replayed_up_to_the_damage(kind, path, tmp_path, capsys
     recover(bad, tmp_path / "recovered.mcap")
     saved = runner.replay(LogReader(tmp_path / "recovered.mcap"))
     assert saved.comparison.identical and saved.end == result["replayed_s"]
+
+
+def test_a_paced_robots_log_is_identical_though_the_walls_clock_does_not_come_again(log, tmp_path):
+    paced = tmp_path / "paced.mcap"
+    with LogWriter(paced) as writer:
+        writer.write_metadata("run", log.metadata["run"] | {"station": "hardware"})
+        for file in log.attachments.values():
+            writer.attach(file.name, file.media_type, file.data)
+        for record in log.records([t for t in log.topics if not t.startswith("/truth/")], end=1.5):
+            writer.write(record.topic, Encoded(serialized(log.decode(record)).kind, record.data), record.time)
+        writer.write(PACE, Pace(1.5, 192, 1, 0.01, 0.002, 0.006, 0.02), 1.5)
+    comparison = runner.replay(LogReader(paced)).comparison
+    assert comparison.identical and PACE not in comparison.topics and len(comparison.topics) > 30
 
 
 def test_a_robots_log_has_no_truth_and_is_replayed_and_reviewed_as_any(path, log, tmp_path, capsys):

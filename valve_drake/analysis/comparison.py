@@ -10,11 +10,12 @@ import numpy as np
 from google.protobuf.message import Message as Proto
 
 from valve_drake.messages import Message
+from valve_drake.pace import PACE
 from valve_drake.recording import schemas
 from valve_drake.recording.foxglove import NANO, nanoseconds
 from valve_drake.recording.reader import LogReader, Record
 
-TRUTH = "/truth/"  # begins the topics that only a simulation has
+UNCOMPARED = ("/truth/", PACE)  # begin the topics that no block says: a simulation's own, and the wall clock's
 LONGEST = 60  # of a value in a report [characters]
 
 
@@ -58,14 +59,14 @@ class TopicDifference:
 
 
 class Comparison:
-    """A recorder's sink: what is written is compared with what a log holds up to `end` [s], the truth left out.
+    """A recorder's sink: what is written is compared with what a log holds up to `end` [s], UNCOMPARED left out.
 
     topics: TopicDifference by name, complete after `finish`. first: the first difference in time; of those in one tick,
     the one whose topic was the first in the log. That is the order of the recorder's table, in which data flows.
     """
 
     def __init__(self, log: LogReader, end: float):
-        self.topics = {name: TopicDifference() for name in log.topics if not name.startswith(TRUTH)}
+        self.topics = {name: TopicDifference() for name in log.topics if not name.startswith(UNCOMPARED)}
         self.first: Divergence | None = None
         self._log = log
         self._kinds: dict[str, type[Proto]] = {}  # that were written, by topic
@@ -83,7 +84,7 @@ class Comparison:
         return max((topic.max_difference for topic in self.topics.values()), default=0.0)
 
     def write(self, topic: str, message: schemas.Loggable, time: float) -> None:
-        if topic.startswith(TRUTH):
+        if topic.startswith(UNCOMPARED):
             return
         when = nanoseconds(time)
         if when != self._when:
