@@ -131,6 +131,7 @@ def test_stamps_on_the_grid_of_slots_come_back_exactly():
         ("hardware.channels.left_leg=A", ["hardware.channels", "left_leg"]),
         ("hardware.channels={base.command: A, torso.command: A}", ["hardware.channels", "A"]),
         ("hardware.answer_time=0", ["hardware.answer_time"]),
+        ("hardware.image_age=1.5", ["hardware.image_age", "1.5"]),  # where the head was then is not known any more
         ("hardware.robot_period=0.01", ["hardware.robot_period", "1/128"]),
         ("hardware.lockstep=maybe", ["hardware.lockstep", "true or false"]),
     ],
@@ -395,7 +396,9 @@ def test_both_eyes_show_the_newest_instant_that_both_have(puppet):
 def test_an_image_too_old_is_not_shown(puppet):
     puppet.image("left_wrist", 3)
     assert look(puppet, puppet.step(), "left_wrist").sequence == 3
-    assert look(puppet, puppet.step(100), "left_wrist").sequence == -1
+    ticks = int(puppet.config.image_age / TICK)
+    assert look(puppet, puppet.step(ticks - 2), "left_wrist").sequence == 3
+    assert look(puppet, puppet.step(4), "left_wrist").sequence == -1
 
 
 def test_a_frozen_camera_is_silent(puppet):

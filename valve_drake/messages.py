@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
+REMEMBERED = 1.0  # where the head and the hands were is known for so long: no older image can be placed [s]
 LEFT, RIGHT = "left", "right"
 SIDES = (LEFT, RIGHT)
 

@@ -4,17 +4,17 @@ from typing import Any
 
 import numpy as np
 
-from valve_drake.messages import SIDES, RobotState
-from valve_drake.ports import Block, Inputs
+from valve_drake.messages import REMEMBERED, SIDES, RobotState
+from valve_drake.ports import TICK, Block, Inputs
 
-HISTORY = 64  # samples of the head's motion that are kept: 0.5 s
+HISTORY = round(REMEMBERED / TICK)  # samples of the head's motion that are kept
 
 
 class RobotStateSystem(Block):
     """All measurement ports of the station in, `robot_state` out (slot 0 of every tick).
 
     The ports are those of stations/contract.py, same names. The message also carries the head's motion of the
-    last half second, so that an image can be placed where the head was when it was taken.
+    last second, so that an image can be placed where the head was when it was taken.
     """
 
     INPUTS = {

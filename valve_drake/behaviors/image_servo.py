@@ -28,6 +28,7 @@ from valve_drake.frames import make
 from valve_drake.kinematics import RobotGeometry
 from valve_drake.messages import (
     LEFT,
+    REMEMBERED,
     SIDES,
     Command,
     HandleMark,
@@ -39,8 +40,9 @@ from valve_drake.messages import (
     Status,
     Verdict,
 )
+from valve_drake.ports import TICK
 
-PAST = 63  # earlier samples of a hand's way that are kept: images up to half a second old can be used
+PAST = round(REMEMBERED / TICK) - 1  # earlier samples of a hand's way that are kept
 
 
 @dc.dataclass

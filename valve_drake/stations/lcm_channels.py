@@ -23,7 +23,7 @@ from drake import (
 from pydrake.lcm import DrakeLcm
 
 from valve_drake.checks import require, require_in
-from valve_drake.messages import SIDES, CameraFrame
+from valve_drake.messages import REMEMBERED, SIDES, CameraFrame
 from valve_drake.ports import SLOT, TICK
 from valve_drake.stations.contract import CAMERAS
 
@@ -273,7 +273,7 @@ class HardwareConfig:
     lockstep: bool = False  # both sides wait for each other instead of the clock: for rehearsals
     answer_time: float = 5.0  # a robot that has not reported everything after this long does not answer [s]
     report_age: float = 0.1  # a wrist sensor silent for longer reads NaN [s]
-    image_age: float = 0.5  # an image older than this is not shown [s]
+    image_age: float = 0.8  # an image older than this is not shown [s]
     command_age: float = 0.1  # on the robot: without commands for longer its joints stop [s]
     robot_period: float = 1 / 32  # of robot.state [s]
     request_period: float = 1 / 32  # of cameras.request [s]
@@ -286,8 +286,9 @@ class HardwareConfig:
         names = list(self.channels.values())
         twice = sorted({name for name in names if names.count(name) > 1 or not name})
         require(not twice, "hardware.channels", "a name of its own for each channel", ", ".join(twice))
-        for key in ("answer_time", "report_age", "image_age", "command_age"):
+        for key in ("answer_time", "report_age", "command_age"):
             require_in(getattr(self, key), TICK, 60.0, f"hardware.{key}")
+        require_in(self.image_age, TICK, REMEMBERED, "hardware.image_age")
         for key in ("robot_period", "request_period"):
             ticks = getattr(self, key) / TICK
             require(ticks >= 1 and ticks == int(ticks), f"hardware.{key}", "a multiple of 1/128 s", getattr(self, key))
