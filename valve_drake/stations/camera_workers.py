@@ -10,12 +10,14 @@ import contextlib
 import dataclasses as dc
 import multiprocessing.connection
 import os
+import pickle
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -63,7 +65,7 @@ class CameraWorkers:
                 code = f"from valve_drake.stations.camera_workers import serve; serve({there.fileno()})"
                 process = subprocess.Popen([sys.executable, "-c", code], pass_fds=[there.fileno()])
             worker = _Worker(process, multiprocessing.connection.Connection(here.detach()))
-            worker.wire.send(rig)
+            _send(worker.wire, rig)
             self._workers.append(worker)
         return self
 
@@ -100,11 +102,11 @@ class CameraWorkers:
             del self._made[name, capture.sequence]
         self._asked[name][capture.sequence] = capture
         with self._wire(name) as wire:
-            wire.send((name, capture))
+            _send(wire, (name, capture))
 
     def _receive(self, name: str) -> None:
         with self._wire(name) as wire:
-            frame, seconds = wire.recv()
+            frame, seconds = _recv(wire)
         profile.beside += seconds
         self._made[frame.camera, frame.sequence] = frame
 
@@ -121,6 +123,15 @@ class CameraWorkers:
             raise RuntimeError(f"the process that renders {name} ended with code {worker.process.wait()}") from error
 
 
+def _send(wire: multiprocessing.connection.Connection, thing: Any) -> None:
+    # Not wire.send: it pickles into a buffer, and CPython 3.12 crashes when that of a failed call is garbage-collected.
+    wire.send_bytes(pickle.dumps(thing, pickle.HIGHEST_PROTOCOL))
+
+
+def _recv(wire: multiprocessing.connection.Connection) -> Any:
+    return pickle.loads(wire.recv_bytes())
+
+
 def serve(fd: int) -> None:
     """The other process: builds the rig, makes what it is asked for, ends when nobody is left to ask."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides when it ends
@@ -128,11 +139,11 @@ def serve(fd: int) -> None:
     cv2.setNumThreads(1)
     wire = multiprocessing.connection.Connection(fd)
     try:
-        rig = CameraRig(*wire.recv())
+        rig = CameraRig(*_recv(wire))
         while True:
-            name, capture = wire.recv()
+            name, capture = _recv(wire)
             begin = time.process_time()
             frame = rig.frame(name, capture)
-            wire.send((frame, time.process_time() - begin))
+            _send(wire, (frame, time.process_time() - begin))
     except (EOFError, ConnectionError):
         pass
