@@ -71,9 +71,9 @@ class Camera:
 
 
 class Bench:
-    """Both hands and their cameras. Arms follow commands two ticks late; an image comes out one image late."""
+    """Both hands and their cameras. Arms follow commands two ticks late; images come out `late` images late."""
 
-    def __init__(self, seed: int, reach: float = 0.06, config: ImageServoConfig = CONFIG):
+    def __init__(self, seed: int, reach: float = 0.06, config: ImageServoConfig = CONFIG, late: int = 1):
         rng = np.random.default_rng(seed)
         self.cameras = {side: Camera(side, rng) for side in SIDES}
         self.law = ImageServo(config, GEOMETRY, {side: camera.teach() for side, camera in self.cameras.items()})
@@ -86,7 +86,7 @@ class Bench:
             q[side] = GEOMETRY.arm_inverse(make(X[:, :3], X[:, 3] + X[:, :3] @ offset), side, Q_REF[side])
         self.queue = [q] * 3
         self.marks = {side: HandleMark() for side in SIDES}
-        self.taken = {side: HandleMark() for side in SIDES}
+        self.taken = [self.marks] * late  # images on their way, the last is the newest
         self.hidden: set[str] = set()
         self.sag = 0.0  # by which the first joint stands below its command [rad]
         self.commands: list[Command] = []
@@ -102,14 +102,15 @@ class Bench:
 
     def step(self, mode: ModeState = SERVO):
         if self.tick % IMAGE == 0:
-            self.marks = self.taken
-            self.taken = {}
+            self.marks, *self.taken = self.taken
+            new = {}
             for side, camera in self.cameras.items():
                 s, area, corners = camera.look(self.X(side))
                 seen = {"found": True, "feature": s, "area": area, "corners": corners}
-                self.taken[side] = HandleMark(
+                new[side] = HandleMark(
                     time=self.time, sequence=self.tick // IMAGE, **({} if side in self.hidden else seen)
                 )
+            self.taken.append(new)
         q = self.queue[0]
         state = RobotState(time=self.time, left_arm=q["left"], right_arm=q["right"])
         marks = HandleMarks(time=self.time, **self.marks)
@@ -269,11 +270,19 @@ def test_a_mark_that_flickers_is_not_lost_but_delays_success():
     assert max(bench.off(side) for side in SIDES) < 0.0015
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_images_of_a_slow_camera_are_placed_where_the_hand_was_then(seed):
+    bench = Bench(seed, late=round(0.8 / DT / IMAGE))
+    status = bench.run()
+    assert status.state == "succeeded", status.detail
+    assert max(bench.off(side) for side in SIDES) < 0.0015
+
+
 def test_images_from_before_the_activation_are_not_used():
     bench = Bench(11)
     for _ in range(3):
         bench.step(ModeState(mode="reach", activation=2))
-    bench.marks = {side: dc.replace(mark, time=5.0) for side, mark in bench.taken.items()}
+    bench.marks = {side: dc.replace(mark, time=5.0) for side, mark in bench.taken[-1].items()}
     bench.tick = 1
     bench.step()
     assert np.isnan(bench.servo.left_error).all()

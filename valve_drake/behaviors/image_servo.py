@@ -40,9 +40,6 @@ from valve_drake.messages import (
     Status,
     Verdict,
 )
-from valve_drake.ports import TICK
-
-PAST = round(REMEMBERED / TICK) - 1  # earlier samples of a hand's way that are kept
 
 
 @dc.dataclass
@@ -136,7 +133,8 @@ class ImageServo:
         p_now = self.geometry.arm_forward(q, side)[:, 3]
         short = hand.X_HG[:, 3] - p_now  # joints that stand off their command for ever must not keep the hand off
         short = short * min(1.0, self.config.sag / max(float(np.linalg.norm(short)), 1e-12))
-        hand = dc.replace(hand, past=(*hand.past[-PAST:], (time, p_now + short)))
+        gone = int(bool(hand.past) and hand.past[0][0] < time - REMEMBERED)
+        hand = dc.replace(hand, past=(*hand.past[gone:], (time, p_now + short)))
         if mark.found and mark.sequence != hand.seen and mark.time >= hand.past[0][0]:
             e = self.taught[side].displacement(mark.feature)
             R = hand.X_HG[:, :3]
