@@ -7,6 +7,7 @@ from valve_drake import frames
 from valve_drake.analysis import experiments
 from valve_drake.analysis.drawn_images import PLATE, RED, Canvas, draw_board
 from valve_drake.perception import joint_fit as mut
+from valve_drake.perception import line_fitting
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads, side_lines
 from valve_drake.perception.marker import NEXT, Marker
 
@@ -70,6 +71,15 @@ def test_covariance_is_honest_and_less_than_that_of_sides_alone(z):
     assert len(values) >= 55
     assert abs(np.mean(values) - 1) < 4 * np.sqrt(2 / (8 * len(values)))
     assert np.mean(gain) > 1.1
+
+
+def test_covariance_does_not_depend_on_the_blur_that_was_looked_for_first(monkeypatch):
+    X, found = pose(1.2, 0.6), []
+    image = canvas(X).finish(np.random.default_rng(3), 2.0)
+    for blur in (0.65, 0.78, 0.95):
+        monkeypatch.setattr(line_fitting, "_SHARP", blur)
+        found.append(np.linalg.inv(fit(image, X).information).diagonal())
+    np.testing.assert_allclose(found, [found[1]] * 3, rtol=0.01)
 
 
 def test_light_that_differs_from_side_to_side_keeps_the_sides_apart():
@@ -151,14 +161,23 @@ def test_jacobian_of_the_corner_pixels_equals_finite_differences():
     np.testing.assert_allclose(J, numeric, atol=6e-3 * np.abs(numeric).max())
 
 
-def test_two_quadrilaterals_in_one_pass_are_fitted_as_each_alone():
+@pytest.mark.parametrize("beside", [False, True])  # one that is found out only when the sides are fitted
+def test_two_quadrilaterals_in_one_pass_are_fitted_as_each_alone(beside):
     rng, near, far = np.random.default_rng(4), pose(0.7), pose(1.6)
     images = [canvas(X).finish(rng, 2.0) for X in (near, far)]
-    plain = np.full_like(images[0], 90)
     corners = [EYE.project(true_corners(X)) for X in (near, far)]
-    both = fit_quads([images[0], plain, images[1]], [corners[0], *corners], LineFittingConfig())
-    assert both[1].reason
-    for X, image, one in zip((near, far), images, (both[0], both[2])):
-        alone = fit(image, X)
-        np.testing.assert_allclose(one.together, alone.together, atol=1e-3)  # each pass stops once all are near
+    endless = canvas(near)  # red goes on beyond one side
+    endless.rectangle(frames.compose(near, frames.make(np.eye(3), np.array([0.0, 0.075, 0.0]))), RED, (0.06, 0.03))
+    other = ([endless.finish(rng, 2.0)], [corners[0]]) if beside else ([], [])
+
+    def passed(images, corners):
+        """In one pass with the other in their middle, since a pass takes as many steps as its slowest needs."""
+        out = fit_quads([images[0], *other[0], *images[1:]], [corners[0], *other[1], *corners[1:]], LineFittingConfig())
+        if beside:
+            assert "no step" in out.pop(1).reason
+        return out
+
+    for k, one in enumerate(passed(images, corners)):
+        (alone,) = passed(images[k : k + 1], corners[k : k + 1])
+        np.testing.assert_allclose(one.together, alone.together, atol=1e-3)
         np.testing.assert_allclose(one.information, alone.information, rtol=1e-3, atol=1e-3 * alone.information.max())

@@ -37,6 +37,7 @@ _OUTSIDE = 2.0  # of a side: pixels used at a corner [px]
 _SHORT = 2 * _WINDOW + 2  # sides below have no corner pixels of their own [px]
 _CUT = 4.5  # a pixel further from the model is not the marker's [sigma]
 _POOR = 2.5  # mean square of a corner's pixels above which it is covered or worn [sigma^2]
+_SHARPER = 0.5  # least share of the blur that one step may leave: further off the model is not linear
 _SAMPLES = 16  # points on each side that stand for it
 PRIOR_POINTS = 20  # how many points the noise of the grey values counts for, against the points' scatter
 
@@ -173,8 +174,8 @@ def joint_fit(
 
     images of the Q channels; curves of their 4 Q sides, level (4 Q, 4) the sides' own levels; blur (Q,); seen,
     bend (4 Q,): prior on each bend; scatter (Q, 2): chi^2 of the edge points about their sides times sigma^2, and its
-    degrees of freedom. None where the light is not that of two planes, there are too few pixels to tell, or the sides
-    do not meet.
+    degrees of freedom. None where the light is not that of two planes, there are too few pixels to tell, the sides do
+    not meet, or the blur was far off.
     """
     Q = len(blur)
     middle = curves.points(curves.first[:, None] + (curves.count[:, None] - 1) * np.array([0.0, 0.5, 1.0]))
@@ -205,6 +206,7 @@ def joint_fit(
     freedom = seen.pixels.reshape(Q, 4).sum(1) - 29
     variance = (seen.square.reshape(Q, 4).sum(1) + apart) / np.maximum(freedom, 1)
     fits = (freedom >= 30) & (lost > apart) & (lost - apart < 10 * _UNEVEN * variance)
+    fits &= 1 + step[:, 18] / blur > _SHARPER
 
     per_shift = (curves.inward / curves.cosine())[:, None]
 
@@ -230,12 +232,12 @@ def joint_fit(
     K = np.zeros((Q, 8, 19))  # undistorted, none has a bend
     K[:, _ROWS, _ROWS // 2 * 3 + 6], K[:, _ROWS, _ROWS // 2 * 3 + 7] = 1, final.tau(t).reshape(Q, 8)
     even = final.points(curves.first[:, None] + (curves.count[:, None] - 1) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES)
+    # What pixels know of an edge's place goes with the inverse of its blur, and H is of the blur before the step.
+    wider = 1 + step[:, 18] / blur
     out: list[tuple[np.ndarray, np.ndarray] | None] = [None] * Q
-    for q in np.flatnonzero(fits):
+    for q in np.flatnonzero(fits & (wider > _SHARPER)):
         chi2, n = scatter[q]
-        spread = (chi2 / variance[q] + PRIOR_POINTS) / (n + PRIOR_POINTS)
-        # What pixels know of an edge's place goes with the inverse of its blur, and H is of the blur before the step.
-        spread *= 1 + step[q, 18] / blur[q]
+        spread = wider[q] * (chi2 / variance[q] + PRIOR_POINTS) / (n + PRIOR_POINTS)
         covariance = variance[q] * spread * (K[q] @ np.linalg.solve(H[q], K[q].T))
         out[q] = even[4 * q : 4 * q + 4], np.linalg.inv(covariance)
     return out
