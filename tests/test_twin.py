@@ -11,16 +11,19 @@ import time as wall
 import numpy as np
 import pytest
 from pydrake.lcm import DrakeLcm
+from pydrake.systems.analysis import Simulator
 
-from valve_drake import rehearsal, runner
+from valve_drake import diagram, rehearsal, runner
 from valve_drake import scenario as scenarios
 from valve_drake.checks import ConfigError
-from valve_drake.messages import Mode
+from valve_drake.messages import Mode, OperatorCommand
 from valve_drake.pace import Pacer
-from valve_drake.ports import TICK
+from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
+from valve_drake.ports import SLOT, TICK
 from valve_drake.recording.reader import LogReader
 from valve_drake.stations.contract import CAMERAS, CONTRACT
 from valve_drake.stations.faults import FaultConfig, Faults, Wire
+from valve_drake.stations.hardware import RobotLink
 from valve_drake.stations.lcm_channels import COMMANDS, CONTROLLER, LOCKSTEP_TIME, REPORTS, REQUEST, ROBOT, SYNC, Bus
 from valve_drake.stations.twin import Guard
 
@@ -255,6 +258,23 @@ def test_the_program_drives_the_twin_through_lcm(short):
     last = [m for _, _, m in log.messages(["/joint_states"])][-1]
     neck = {joint.name: joint.position for joint in last.joints}
     assert abs(neck["neck_yaw"]) > 0.01 or abs(neck["neck_pitch"]) > 0.01, "the gaze has moved"
+
+
+def test_no_command_waits_for_an_image(monkeypatch):
+    done = []
+    send, look = RobotLink.send, ColorSegmentationSystem.step
+    monkeypatch.setattr(RobotLink, "send", lambda *args: done.append("send") or send(*args))
+    monkeypatch.setattr(ColorSegmentationSystem, "step", lambda *args: done.append("look") or look(*args))
+    scenario = scenarios.resolve(near())
+    with rehearsal.beside(scenario) as (link, _):
+        system = diagram.make_diagram(scenario, link=link)
+        simulator = Simulator(system.diagram)
+        diagram.command(system, simulator.get_mutable_context(), OperatorCommand(0, scenario.command))
+        simulator.Initialize()
+        simulator.AdvanceTo(TICK + 2.9 * SLOT)  # the first look is due in tick 1
+        assert done == ["send"]
+        simulator.AdvanceTo(TICK + 3.4 * SLOT)
+        assert done == ["send", "send", "look"]
 
 
 def test_in_lock_step_all_devices_are_fresh_and_nothing_is_refused(short):

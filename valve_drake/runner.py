@@ -39,7 +39,7 @@ from valve_drake.recording.signals import signals
 from valve_drake.recording.writer import LogError, LogWriter
 from valve_drake.scenario import Scenario, dump, parse, resolve, with_overrides
 from valve_drake.stations.camera_workers import CameraWorkers
-from valve_drake.stations.hardware import RobotLink
+from valve_drake.stations.hardware import AHEAD, RobotLink
 from valve_drake.stations.lcm_channels import Bus
 from valve_drake.stations.replay import Recording
 
@@ -254,7 +254,7 @@ def _in_real_time(simulator: Simulator, pacer: Pacer, sink: Sink) -> Callable[[f
     def go(until: float) -> None:
         while True:
             tick = int(context.get_time() / TICK + 1 / 4) * TICK
-            commands, rest = (functools.partial(simulator.AdvanceTo, tick + n * SLOT) for n in (3, 3.25))
+            commands, rest = (functools.partial(simulator.AdvanceTo, tick + end) for end in (3 * SLOT, TICK - AHEAD))
             pacer.tick(commands, rest)
             now = context.get_time()
             if int(tick) != int(tick + TICK):
