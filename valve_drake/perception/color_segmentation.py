@@ -194,7 +194,7 @@ def _contrast(share: np.ndarray, config: ColorSegmentationConfig) -> np.ndarray:
 
 
 def every(image: np.ndarray, step: int) -> np.ndarray:
-    """Every step-th pixel of every step-th row (1 or 2), as slices would give them but sooner."""
+    """Every step-th pixel of every step-th row (1 or 2), but perhaps the last: what slices give, sooner."""
     return image if step == 1 else cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST)
 
 

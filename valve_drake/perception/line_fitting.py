@@ -239,6 +239,7 @@ def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tu
 
 
 def _step(corners: np.ndarray) -> int:
+    """Every how many-th pixel tells the colours and the coarse lines of a quadrilateral (4, 2)."""
     return 2 if np.ptp(corners, axis=0).max() > _LARGE else 1
 
 

@@ -523,8 +523,7 @@ def _candidates(
             return fits
         # The mirrored tilt itself, moved to fit, stands for a minimum that it may not have.
         stand_in = dc.replace(fits[0], R=mirrored[0], cost=max(left, fits[0].cost))
-        if left <= fits[0].cost + _HOPELESS:
-            fits = _distinct(moments, model, [mirrored], config, known=fits)
+        fits = _distinct(moments, model, [mirrored], config, known=fits)
         if len(fits) == 1:
             fits.append(stand_in)
     return fits
@@ -542,7 +541,7 @@ def _distinct(
     for R, p in starts:
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
             continue
-        if fits and known is None and _moved_to_fit(moments, model, R, p) > fits[0].cost + _HOPELESS:
+        if fits and _moved_to_fit(moments, model, R, p) > fits[0].cost + _HOPELESS:
             continue
         fit = _refine(moments, model, R, p, 0.0, config, enough=0.05)
         if fit is not None and fit.R[2, 2] > 0:
