@@ -59,8 +59,8 @@ def recording(log):
     return Recording(log)
 
 
-def rewritten(log, path, topics=lambda topic: True, end=0.1, files=True, **facts):
-    """A log with some of the messages of another, and other metadata."""
+def rewritten(log, path, topics=lambda topic: True, end=0.1, files=True, also=(), **facts):
+    """A log with some of the messages of another and, last, more of them (topic, message, time); other metadata."""
     with LogWriter(path) as writer:
         writer.write_metadata("run", log.metadata["run"] | facts)
         for file in log.attachments.values() if files else ():
@@ -68,6 +68,8 @@ def rewritten(log, path, topics=lambda topic: True, end=0.1, files=True, **facts
         for record in log.records([t for t in log.topics if topics(t)], end=end):
             kind = serialized(log.decode(record)).kind
             writer.write(record.topic, Encoded(kind, record.data), record.time)
+        for message in also:
+            writer.write(*message)
     return path
 
 
@@ -262,14 +264,8 @@ def test_a_damaged_log_is_replayed_up_to_the_damage(kind, path, tmp_path, capsys
 
 
 def test_a_paced_robots_log_is_identical_though_the_walls_clock_does_not_come_again(log, tmp_path):
-    paced = tmp_path / "paced.mcap"
-    with LogWriter(paced) as writer:
-        writer.write_metadata("run", log.metadata["run"] | {"station": "hardware"})
-        for file in log.attachments.values():
-            writer.attach(file.name, file.media_type, file.data)
-        for record in log.records([t for t in log.topics if not t.startswith("/truth/")], end=1.5):
-            writer.write(record.topic, Encoded(serialized(log.decode(record)).kind, record.data), record.time)
-        writer.write(PACE, Pace(1.5, 192, 1, 0.01, 0.002, 0.006, 0.02), 1.5)
+    pace = PACE, Pace(1.5, 192, 1, 0.01, 0.002, 0.006, 0.02), 1.5
+    paced = rewritten(log, tmp_path / "a.mcap", lambda topic: not topic.startswith("/truth/"), 1.5, also=[pace])
     comparison = runner.replay(LogReader(paced)).comparison
     assert comparison.identical and PACE not in comparison.topics and len(comparison.topics) > 30
 
