@@ -107,6 +107,7 @@ class Bench:
         self.memory, self.command = self.law.step(
             self.time, self.memory, state, mode, self.estimate, self.marks, self.turn
         )
+        self.memory = self.law.watch_stance(self.time, self.memory, mode, self.estimate)
         if self.command.left_arm is not None:
             self.arms = np.concatenate([self.command.left_arm, self.command.right_arm])
             self.commands.append(self.arms)
@@ -533,3 +534,13 @@ def test_block_holds_its_outputs_between_updates():
 def test_block_clones_are_independent():
     change = {"mode": ModeState(mode="measure", activation=2)}
     assert_clones_are_independent(rig, change, ("command", "status", "stance"))
+
+
+def test_no_command_of_the_arms_waits_for_the_stance(monkeypatch):
+    bench = Bench(np.array([0.1, -0.2, 0.1]))
+    monkeypatch.setattr(bench.law, "watch_stance", lambda time, memory, mode, estimate: memory)
+    bench.run(Mode.FINE_APPROACH, limit=3.0)
+    assert not bench.memory.stance.found and not bench.memory.stance_looks
+    monkeypatch.undo()
+    bench.run(Mode.FINE_APPROACH, limit=3.0)
+    assert bench.memory.stance.found

@@ -12,12 +12,15 @@ joints within one tick and no two blocks that feed each other run at the same in
     slot 2  command_selector
     slot 3  supervisor, perception, and the station's wrench sensors, all for the next tick
 
-On a robot the commands leave at the beginning of slot 3: what takes longest, to look at an image, holds up none.
+On a robot the commands leave at the beginning of slot 3: what takes longest, to look at an image and to plan where to
+stand (`later`), holds up none.
 
 Every block uses UNRESTRICTED updates: a discrete update would see the plant already stepped.
 """
 
+import functools
 import time as _time
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -114,7 +117,12 @@ class Block(LeafSystem):
             self._held[port] = index
             self.DeclareStateOutputPort(port, index)
         self.period = period
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, slot * SLOT + delay, self._update)
+        works = [(slot, self.step)]
+        if type(self).later is not Block.later:
+            works.append((3, self.later))
+        for when, work in works:
+            run = functools.partial(self._update, work)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(period, when * SLOT + delay, run)
 
     def initial(self) -> Any:
         """The memory before the first step: immutable, or None."""
@@ -124,14 +132,17 @@ class Block(LeafSystem):
         """One step: new memory, and the outputs that change (those left out keep their value)."""
         raise NotImplementedError(f"{type(self).__name__}.step")  # abstract
 
+    def later(self, time: float, inputs: Inputs, memory: Any) -> tuple[Any, dict[str, Any]]:
+        """What of a step takes long and can wait for slot 3, when the commands have left; not run unless written."""
+        return memory, {}
+
     def memory(self, context: Context) -> Any:
         """The memory in this Context, for tests and reports."""
         return context.get_abstract_state(int(self._memory)).get_value().value
 
-    def _update(self, context: Context, state: State) -> None:
+    def _update(self, work: Callable, context: Context, state: State) -> None:
         with profile("stages"):
-            now = context.get_time()
-            memory, outputs = self.step(now, Inputs(self, context), self.memory(context))
+            memory, outputs = work(context.get_time(), Inputs(self, context), self.memory(context))
         abstract = state.get_mutable_abstract_state()
         abstract.get_mutable_value(int(self._memory)).set_value(_Held(memory))
         for port, value in outputs.items():

@@ -138,7 +138,7 @@ class KinematicApproach:
         marks: HandleMarks,
         turn: TurnState,
     ) -> tuple[Memory, Command]:
-        """One tick -> new memory (with status, stance and plan in it), command."""
+        """One tick -> new memory (with status, stance and plan in it), command. `watch_stance` follows it."""
         measured = np.concatenate([state.left_arm, state.right_arm])
         m = memory
         if mode.activation != m.activation:
@@ -152,9 +152,7 @@ class KinematicApproach:
         if mode.mode in run:
             m = run[Mode(mode.mode)](time, m, state, mode, estimate, marks, turn)
         else:
-            if mode.mode == Mode.FINE_APPROACH:
-                m = self._watch_stance(time, m, mode, estimate)
-            elif mode.mode == Mode.SEARCH:
+            if mode.mode == Mode.SEARCH:
                 m = dc.replace(m, stance=Stance(), stance_looks=())
             m = self._homing(time, m, self._valve(m, state, turn))
         if m.path is not None:
@@ -213,7 +211,11 @@ class KinematicApproach:
         return out
 
     # ------------------------------------------------------------ stance
-    def _watch_stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
+    def watch_stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
+        """In fine approach: where the base should stand. It takes as long as two ticks may, and no command needs it."""
+        return self._find_stance(time, m, mode, estimate) if mode.mode == Mode.FINE_APPROACH else m
+
+    def _find_stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
         """Where to stand, from the last few estimates; the nearer the better, so old ones are dropped."""
         if not estimate.found or estimate.sequence == m.seen:
             return m
@@ -260,7 +262,7 @@ class KinematicApproach:
         X_BV = compose(inverse(planar(*state.odometry[:3])), fused.X_OV)
         arc = best_arc(X_BV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view)
         if arc.margin < self.stance.margin_min:
-            m = self._watch_stance(time, dc.replace(m, stance_looks=m.looks, seen=-1), mode, estimate)
+            m = self._find_stance(time, dc.replace(m, stance_looks=m.looks, seen=-1), mode, estimate)
             return self._status(
                 dc.replace(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, f"stance: arm margin {arc.margin:.2f}"
             )

@@ -59,3 +59,7 @@ class KinematicApproachSystem(Block):
             "stance": memory.stance,
             "plan": memory.plan,
         }
+
+    def later(self, time: float, inputs: Inputs, memory: Memory) -> tuple[Memory, dict[str, Any]]:
+        memory = self._law.watch_stance(time, memory, inputs.mode, inputs.estimate)
+        return memory, {"stance": memory.stance}
