@@ -17,7 +17,7 @@ from valve_drake.checks import ConfigError
 from valve_drake.messages import CameraFrame, ModeState
 from valve_drake.perception.color_segmentation import (
     ColorSegmentationConfig,
-    _half_shares,
+    _shares,
     middle,
     polygon_area,
     quadrilateral,
@@ -156,7 +156,7 @@ def test_marker_half_in_shadow_or_with_a_covered_corner_is_whole(what, z):
 def test_a_share_is_nearly_the_same_in_half_the_light():
     image = np.empty((8, 8, 3), np.uint8)
     image[:] = RED
-    light, shade = (float(_half_shares((factor * image).astype(np.uint8))[0].mean()) for factor in (1, 0.5))
+    light, shade = (float(_shares((factor * image).astype(np.uint8))["red"].mean()) for factor in (1, 0.5))
     assert 0.8 * light < shade <= light
 
 

@@ -95,8 +95,8 @@ def test_light_that_differs_from_side_to_side_keeps_the_sides_apart():
 def test_a_corner_that_is_worn_off_is_not_used(wear, monkeypatch):
     X, rng, used, look = pose(1.0), np.random.default_rng(2), [], mut._corner_pixels
 
-    def spy(images, curves, ends, planes, blur, frame, variance, wanted):
-        J, r, owner = look(images, curves, ends, planes, blur, frame, variance, wanted)
+    def spy(sheet, curves, ends, planes, blur, frame, variance, quads):
+        J, r, owner = look(sheet, curves, ends, planes, blur, frame, variance, quads)
         px = frame[0][0] + frame[1][0] * J[:, 1:3]
         used.append(set(np.linalg.norm(px[:, None] - ends[0], axis=2).argmin(1).tolist()))
         return J, r, owner
@@ -142,17 +142,18 @@ def test_jacobian_of_the_corner_pixels_equals_finite_differences():
         start=np.array([20.2, 60.4, 60.1, 19.7]),
         slope=np.array([0.1, -0.1, 0.1, -0.1]) * 0.3,
         coefficient=np.array([[0.1, 0.05, 0.02]] * 4),
+        cosine=np.full(4, 1 / np.hypot(1, 0.03)),
     )
-    images = mut.Images.of([np.random.default_rng(0).random((81, 81)).astype(np.float32)])
+    sheet = mut.Sheet.of([np.random.default_rng(0).random((81, 81)).astype(np.float32)])
     planes = np.array([[0.02, 0.01, -0.01, 0.97, 0.02, 0.01]])
-    frame, variance, wanted = (np.array([[40.0, 40.0]]), np.array([20.0])), np.array([1e4]), np.array([True])
+    frame, variance, quads = (np.array([[40.0, 40.0]]), np.array([20.0])), np.array([1e4]), np.array([0])
     ends = np.rint(mut._corners(curves))
 
     def pixels(d):
-        shift = d[6:18].reshape(4, 3) * (curves.inward / curves.cosine())[:, None]
+        shift = d[6:18].reshape(4, 3) * (curves.inward / curves.cosine)[:, None]
         moved = mut.dc.replace(curves, coefficient=curves.coefficient + shift)
         light, blur = planes + d[:6], np.array([0.8 + d[18]])
-        return mut._corner_pixels(images, moved, ends, light, blur, frame, variance, wanted)
+        return mut._corner_pixels(sheet, moved, ends, light, blur, frame, variance, quads)
 
     J, *_ = pixels(np.zeros(19))
     assert len(J) > 60
@@ -177,7 +178,9 @@ def test_two_quadrilaterals_in_one_pass_are_fitted_as_each_alone(beside):
             assert "no step" in out.pop(1).reason
         return out
 
-    for k, one in enumerate(passed(images, corners)):
+    for k, (one, X) in enumerate(zip(passed(images, corners), (near, far))):
         (alone,) = passed(images[k : k + 1], corners[k : k + 1])
-        np.testing.assert_allclose(one.together, alone.together, atol=1e-3)
-        np.testing.assert_allclose(one.information, alone.information, rtol=1e-3, atol=1e-3 * alone.information.max())
+        # Coarse lines are looked for at the resolution that suits the smallest: a side may have a profile more or less.
+        apart = distances(one, X) - distances(alone, X)
+        assert apart @ alone.information @ apart / 8 < 0.02
+        np.testing.assert_allclose(one.information, alone.information, atol=0.03 * alone.information.max())

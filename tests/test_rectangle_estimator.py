@@ -136,8 +136,9 @@ def test_refined_is_exact_without_noise_whatever_corner_comes_first(cameras, k):
 def test_jacobian_equals_finite_differences(told):
     X = facing(0.9, 0.4, -0.3, 0.5, 0.1, 0.05)
     edges = edge_points(X, HEAD, MARKER, 0.1, np.random.default_rng(0))
-    views, _ = _views(with_information(edges) if told == "information" else edges, HEAD, CONFIG)
-    moments = _moments(views, [v.trust for v in views], CONFIG)
+    config = dc.replace(CONFIG, yaw_sigma=0.02)
+    views, _ = _views(with_information(edges) if told == "information" else edges, HEAD, config)
+    moments = _moments(views, [v.trust for v in views], config)
     model, yaw, e = MARKER.corners(), 0.01, 1e-6
     R, p = frames.rotation(np.array([0.02, -0.01, 0.03])) @ X[:, :3], X[:, 3] + 0.003
 

@@ -16,6 +16,8 @@ R_AB rotation, V_AB = [w; v], F = [torque; force].
 Valve angle: positive opens = counter-clockwise seen from the robot = about -z of V.
 """
 
+import math
+
 import numpy as np
 
 
@@ -34,11 +36,17 @@ def rotation_vector(R: np.ndarray) -> np.ndarray:
 
 def rotation(w: np.ndarray) -> np.ndarray:
     """exp([w]x): rotation matrix of axis times angle (3,) -> (3, 3)."""
-    angle = float(np.linalg.norm(w))
-    K = skew(np.asarray(w, float))
-    if angle < 1e-8:
-        return np.eye(3) + K + K @ K / 2
-    return np.eye(3) + np.sin(angle) / angle * K + (1 - np.cos(angle)) / angle**2 * (K @ K)
+    x, y, z = np.asarray(w, float).tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    a = math.sin(angle) / angle if angle > 1e-8 else 1.0
+    b = 2 * (math.sin(angle / 2) / angle) ** 2 if angle > 1e-8 else 0.5
+    return np.array(
+        [
+            [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
+        ]
+    )
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -70,7 +78,9 @@ def rot_z(a: float) -> np.ndarray:
 
 def make(R: np.ndarray, p: np.ndarray) -> np.ndarray:
     """[R | p] -> (3, 4)."""
-    return np.column_stack([R, p])
+    X = np.empty((3, 4))
+    X[:, :3], X[:, 3] = R, p
+    return X
 
 
 def compose(*X: np.ndarray) -> np.ndarray:

@@ -42,10 +42,11 @@ class Message:
             frozen = type(value) is np.ndarray and value.base is None and not value.flags.writeable
             if not (frozen and value.dtype == np.float64):  # one that nobody can change is shared
                 value = np.array(value, dtype=np.float64)
-            if value.size == 0 and -1 in shape:
-                value = value.reshape([0 if n < 0 else n for n in shape])
-            if value.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, value.shape)):
-                raise ValueError(f"{type(self).__name__}.{name} must have shape {shape}, got {value.shape}")
+            if value.shape != shape:  # else it is a fixed one, and right
+                if value.size == 0 and -1 in shape:
+                    value = value.reshape([0 if n < 0 else n for n in shape])
+                if value.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, value.shape)):
+                    raise ValueError(f"{type(self).__name__}.{name} must have shape {shape}, got {value.shape}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 

@@ -67,12 +67,19 @@ class Lens:
         require(worst > -0.9, f"{key}.k_u, k_v", "so small that the image does not fold back", (self.k_u, self.k_v))
 
     def normalize(self, px: np.ndarray) -> np.ndarray:
-        d = px - np.array([self.u_0, self.v_0])
-        r2 = (d * d).sum(-1)[..., None]
-        return d * (1 + np.array([self.k_u, self.k_v]) * r2) / np.array([self.k_x, self.k_y])
+        u, v, rr = self._from_axis(px)
+        out = np.empty(np.shape(px))
+        out[..., 0], out[..., 1] = u * (1 + self.k_u * rr) / self.k_x, v * (1 + self.k_v * rr) / self.k_y
+        return out
 
     def normalize_jacobian(self, px: np.ndarray) -> np.ndarray:
-        return self._corrected_jacobian(px - np.array([self.u_0, self.v_0])) / np.array([[self.k_x], [self.k_y]])
+        u, v, rr = self._from_axis(px)
+        out = np.empty((*np.shape(px), 2))
+        out[..., 0, 0] = (1 + self.k_u * (rr + 2 * u * u)) / self.k_x
+        out[..., 1, 1] = (1 + self.k_v * (rr + 2 * v * v)) / self.k_y
+        uv = 2 * u * v
+        out[..., 0, 1], out[..., 1, 0] = self.k_u / self.k_x * uv, self.k_v / self.k_y * uv
+        return out
 
     def project(self, xy: np.ndarray) -> np.ndarray:
         # Eq. (1) has one unknown, r^2: with it, u - u_0 = (u' - u_0) / (1 + k_u r^2), and v likewise.
@@ -95,12 +102,11 @@ class Lens:
     def focal(self) -> float:
         return float(np.sqrt(self.k_x * self.k_y))
 
-    def _corrected_jacobian(self, d: np.ndarray) -> np.ndarray:
-        """d (u', v') / d (u, v) at d = (u - u_0, v - v_0)."""
-        k = np.array([self.k_u, self.k_v])
-        J = 2 * (k * d)[..., :, None] * d[..., None, :]
-        J[..., [0, 1], [0, 1]] += 1 + k * (d * d).sum(-1)[..., None]
-        return J
+    def _from_axis(self, px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """u - u_0, v - v_0 and r^2 of eq. (1)."""
+        px = np.asarray(px, float)
+        u, v = px[..., 0] - self.u_0, px[..., 1] - self.v_0
+        return u, v, u * u + v * v
 
 
 @dc.dataclass(frozen=True, eq=False)

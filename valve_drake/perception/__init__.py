@@ -37,11 +37,12 @@ def estimate_rectangle(
     Raises ConfigError for an impossible marker or configuration, ValueError for images of another size.
     """
     marker = Marker(size=list(marker_size), handle_radius=max(0.15, max(marker_size)))
+    given = [config for config in (segmentation, lines, matching) if config is not None]
     segmentation = segmentation or ColorSegmentationConfig()
     lines = lines or LineFittingConfig(single_camera=right is None)
     matching = matching or StereoPositioningConfig()
     estimator = estimator or RectangleEstimatorConfig(method=method)
-    for config in (marker, segmentation, lines, matching, estimator):
+    for config in (marker, estimator, *given):
         config.check()
     seen = []
     for image, lens, camera in ((left, head.left, "left"), (right, head.right, "right")):

@@ -93,13 +93,12 @@ def segment(
     image: (H, W, 3) uint8 RGB. roi: x, y, width, height [px]: look only there.
     """
     x, y, w, h = roi if roi else (0, 0, image.shape[1], image.shape[0])
-    part = image[y : y + h, x : x + w]
-    shares = _half_shares(part)
-    regions, red = _regions(image, shares, (x, y), config, "red")
+    half = _Half.of(image[y : y + h, x : x + w], (x, y))
+    regions, red = _regions(image, half, config, "red")
     red += [_judge(image, region, config) for region in regions]
     accepted = sorted((c for c in red if not c.rejected), key=lambda c: -c.score)
     rejected = sorted((c for c in red if c.rejected), key=lambda c: -c.area)
-    return (*accepted, *rejected), _green_marks(shares, (x, y), config)
+    return (*accepted, *rejected), _green_marks(half, config)
 
 
 def segmented(
@@ -112,7 +111,7 @@ def segmented(
 
 def green_regions(image: np.ndarray, config: ColorSegmentationConfig) -> list[Region]:
     """Green regions cut out at full resolution, for the wrist cameras."""
-    return _regions(image, _half_shares(image), (0, 0), config, "green")[0]
+    return _regions(image, _Half.of(image, (0, 0)), config, "green")[0]
 
 
 def quadrilateral(contour: np.ndarray) -> np.ndarray | None:
@@ -120,7 +119,7 @@ def quadrilateral(contour: np.ndarray) -> np.ndarray | None:
 
     A corner that something covers is where the sides beside it would meet.
     """
-    hull = cv2.convexHull(contour.astype(np.int32).reshape(-1, 1, 2))
+    hull = cv2.convexHull(contour.astype(np.float32).reshape(-1, 1, 2))
     length = cv2.arcLength(hull, True)
     for share in (0.02, 0.03, 0.045, 0.06, 0.08):
         corners = cv2.approxPolyDP(hull, share * length, True)[:, 0].astype(float)
@@ -165,12 +164,24 @@ def _signed_area(p: np.ndarray) -> float:
     return float(p[:, 0] @ q[:, 1] - p[:, 1] @ q[:, 0]) / 2
 
 
-def _half_shares(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The shares of red and of green in the light [%], none below 0, at half resolution, (H // 2, W // 2) uint8."""
-    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    *colors, light = cv2.split(cv2.transform(small, _MIX))
-    red, green = (cv2.divide(color, light, scale=100) for color in colors)
-    return red, green
+@dc.dataclass(frozen=True)
+class _Half:
+    """A part of an image at half resolution, (H, W, 3) uint8, and the share of each colour in its light."""
+
+    image: np.ndarray
+    origin: tuple[int, int]  # of the part [px of the full image]
+    share: dict[str, np.ndarray]  # (H, W) uint8 [%], see `_shares`
+
+    @classmethod
+    def of(cls, part: np.ndarray, origin: tuple[int, int]) -> "_Half":
+        small = cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        return cls(small, origin, _shares(small))
+
+
+def _shares(image: np.ndarray) -> dict[str, np.ndarray]:
+    """The shares of red and of green in the light of an image (H, W, 3) uint8, none below 0; (H, W) uint8 [%]."""
+    *colors, light = cv2.split(cv2.transform(image, _MIX))
+    return {name: cv2.divide(color, light, scale=100) for name, color in zip(_COLORS, colors)}
 
 
 def _contrast(share: np.ndarray, config: ColorSegmentationConfig) -> np.ndarray:
@@ -182,8 +193,8 @@ def _contrast(share: np.ndarray, config: ColorSegmentationConfig) -> np.ndarray:
     small = share
     for part in (2, _COARSE):  # halves of halves are means of 4 x 4 as well, and sooner had
         small = cv2.resize(small, [max(n // part, 1) for n in size], interpolation=cv2.INTER_AREA)
-    counts = cv2.calcHist([small], [0], None, [256], [0, 256])[:, 0]
-    small = np.maximum(small, np.uint8(np.searchsorted(np.cumsum(counts), small.size / 2)))
+    some = small[::2, ::2].ravel()
+    small = cv2.max(small, float(np.partition(some, len(some) // 2)[len(some) // 2]))
     means = []
     for box in (config.small_box, config.large_box):
         # A neighbourhood larger than the image would read past its reflection.
@@ -203,14 +214,10 @@ def _outlines(mask: np.ndarray) -> list[np.ndarray]:
 
 
 def _regions(
-    image: np.ndarray,
-    shares: tuple[np.ndarray, np.ndarray],
-    origin: tuple[int, int],
-    config: ColorSegmentationConfig,
-    color: str,
+    image: np.ndarray, half: _Half, config: ColorSegmentationConfig, color: str
 ) -> tuple[list[Region], list[MarkerCandidate]]:
     """Regions cut out at full resolution, and those that their coarse outline already rules out."""
-    contrast = _contrast(shares[_COLORS[color]], config)
+    contrast = _contrast(half.share[color], config)
     seeds, ruled_out = [], []
     for outline in _outlines(cv2.compare(contrast, config.min_contrast, cv2.CMP_GT)):
         bx, by, bw, bh = cv2.boundingRect(outline)
@@ -218,7 +225,7 @@ def _regions(
             continue
         reason = _coarse_reason(outline, (bx, by, bw, bh), contrast.shape, config)
         if reason and color == "red":
-            low = np.array([bx, by], float) * 2 + origin
+            low = np.array([bx, by], float) * 2 + half.origin
             size = np.array([bw, bh], float) * 2
             corners = low + size * [[0, 0], [1, 0], [1, 1], [0, 1]]
             area = 4 * cv2.contourArea(outline)
@@ -227,10 +234,8 @@ def _regions(
             seeds.append((cv2.sumElems(contrast[by : by + bh, bx : bx + bw])[0], (bx, by, bw, bh)))
     seeds.sort(key=lambda seed: -seed[0])
     found: list[Region] = []
-    for _, (bx, by, bw, bh) in seeds[: config.max_candidates]:
-        box = (origin[0] + 2 * bx, origin[1] + 2 * by, 2 * bw, 2 * bh)
-        local = contrast[by : by + bh, bx : bx + bw]
-        region = _cut_out(image, box, local, _COLORS[color])
+    for _, box in seeds[: config.max_candidates]:
+        region = _cut_out(image, half, box, contrast, color)
         if region is not None and not any(np.abs(region.center - r.center).max() < 1.5 for r in found):
             found.append(region)
     return found, ruled_out
@@ -255,33 +260,34 @@ def _coarse_reason(
     return ""
 
 
-def _cut_out(image: np.ndarray, box: tuple[int, int, int, int], contrast: np.ndarray, color: int) -> Region | None:
-    """The region of a box at full resolution, a large one at half of it.
+def _cut_out(
+    image: np.ndarray, half: _Half, box: tuple[int, int, int, int], contrast: np.ndarray, color: str
+) -> Region | None:
+    """The region of a box in the half image at full resolution, a large one at half of it.
 
-    contrast: the half-resolution contrast within the box, whose upper half marks the region's inside.
+    contrast: of the half image, whose upper half within the box marks the region's inside.
     """
     x, y, w, h = box
-    pad = 4 + 2 * (max(w, h) // 10)
+    pad = 2 + max(w, h) // 5
     x0, y0 = max(x - pad, 0), max(y - pad, 0)
-    x1, y1 = min(x + w + pad, image.shape[1]), min(y + h + pad, image.shape[0])
-    step = 2 if max(w, h) > _LARGE else 1
-    # Not cut off at 0 here: what is green beside red counts.
-    part = every(image[y0:y1, x0:x1], step).astype(np.float32)
-    opponent, light = (cv2.transform(part, _MIX[k : k + 1]) for k in (color, 2))
-    channel = cv2.divide(opponent, light, scale=100)
-    to_half = np.s_[:: 2 // step, :: 2 // step]  # where the levels are found
-    half = np.ascontiguousarray(channel[to_half])
-    strong = cv2.compare(contrast, 0.6 * float(contrast.max()), cv2.CMP_GT)
-    inside = np.zeros(half.shape, np.uint8)
-    v, u = (y - y0) // 2, (x - x0) // 2
-    inside[v : v + h // 2, u : u + w // 2] = strong[: inside.shape[0] - v, : inside.shape[1] - u]
-    around = cv2.bitwise_not(cv2.dilate(inside, _SQUARE))
-    high = cv2.mean(half, inside)[0]
-    around[1:-1, 1:-1] &= cv2.compare(half[1:-1, 1:-1], high, cv2.CMP_LT)
-    low = cv2.mean(half, around)[0]
-    halfway = (high + low) / 2
-    mask = cv2.compare(channel, halfway, cv2.CMP_GT)
-    seed = _outline_with_most_of(mask, inside, to_half)
+    x1, y1 = min(x + w + pad, contrast.shape[1]), min(y + h + pad, contrast.shape[0])
+    part, share = half.image[y0:y1, x0:x1], half.share[color][y0:y1, x0:x1]
+    local = contrast[y : y + h, x : x + w]
+    strong = cv2.compare(local, 0.6 * float(local.max()), cv2.CMP_GT)
+    inside = cv2.copyMakeBorder(strong, y - y0, y1 - y - h, x - x0, x1 - x - w, cv2.BORDER_CONSTANT, value=0)
+    high = cv2.mean(share, inside)[0]
+    around = cv2.subtract(cv2.compare(share, high, cv2.CMP_LT), cv2.dilate(inside, _SQUARE))
+    halfway = (high + cv2.mean(share, around)[0]) / 2
+    step = 2 if 2 * max(w, h) > _LARGE else 1
+    offset = np.array([half.origin[0] + 2 * x0, half.origin[1] + 2 * y0], float)
+    if step == 1:
+        u, v = offset.astype(int)
+        part = image[v : v + 2 * (y1 - y0), u : u + 2 * (x1 - x0)]
+        share = _shares(part)[color]
+    else:
+        offset += 0.5  # a pixel of the half image is the mean of four
+    mask = cv2.compare(share, halfway, cv2.CMP_GT)
+    seed = _outline_with_most_of(mask, inside, 2 // step)
     if seed is None:
         return None
     contour = seed[:, 0].astype(float)
@@ -294,26 +300,27 @@ def _cut_out(image: np.ndarray, box: tuple[int, int, int, int], contrast: np.nda
     near = cv2.dilate(region, _SQUARE, iterations=2 // step)
     ring = cv2.subtract(cv2.dilate(near, _SQUARE, iterations=2 // step), near)
     ringed = cv2.countNonZero(ring)
-    clear = cv2.countNonZero(cv2.bitwise_and(ring, cv2.compare(channel, halfway, cv2.CMP_LT)))
+    clear = ringed - cv2.countNonZero(cv2.bitwise_and(ring, mask))
     core = cv2.erode(region, _SQUARE) if area > 100 else region
-    offset = np.array([x0, y0], float)
+    difference = np.subtract(cv2.mean(part, core), cv2.mean(part, ring))
     return Region(
         contour=step * contour + offset,
         center=step * center + offset,
         area=float(area) * step**2,
-        contrast=cv2.mean(opponent, core)[0] - cv2.mean(opponent, ring)[0],
+        contrast=float(_MIX[_COLORS[color], :3] @ difference[:3]),
         evenness=clear / ringed if ringed else 0.0,
     )
 
 
-def _outline_with_most_of(mask: np.ndarray, inside: np.ndarray, part: tuple[slice, slice]) -> np.ndarray | None:
-    """Of the outlines in `mask`, the one whose filled area holds most of `inside`, a mask of `part` of its pixels."""
+def _outline_with_most_of(mask: np.ndarray, inside: np.ndarray, step: int) -> np.ndarray | None:
+    """Of the outlines in `mask`, the one whose filled area holds most of `inside`, a mask of every step-th pixel."""
     outlines = sorted(_outlines(mask), key=cv2.contourArea, reverse=True)[:3]
     held = []
     for outline in outlines if len(outlines) > 1 else ():
         filled = np.zeros(mask.shape, np.uint8)
         cv2.drawContours(filled, [outline], -1, 255, -1)
-        held.append(cv2.countNonZero(cv2.bitwise_and(np.ascontiguousarray(filled[part]), inside)))
+        filled = np.ascontiguousarray(filled[::step, ::step][: inside.shape[0], : inside.shape[1]])
+        held.append(cv2.countNonZero(cv2.bitwise_and(filled, inside[: filled.shape[0], : filled.shape[1]])))
     if held:
         return outlines[int(np.argmax(held))] if max(held) else None
     return outlines[0] if outlines else None
@@ -356,11 +363,9 @@ def _judge(image: np.ndarray, region: Region, config: ColorSegmentationConfig) -
     return MarkerCandidate(corners=corners, center=region.center, area=region.area, score=score, rejected=rejected)
 
 
-def _green_marks(
-    shares: tuple[np.ndarray, np.ndarray], origin: tuple[int, int], config: ColorSegmentationConfig
-) -> np.ndarray:
-    """Centres of small green regions, weighted by contrast, from the half-resolution shares; (n, 3)."""
-    contrast = _contrast(shares[_COLORS["green"]], config)
+def _green_marks(half: _Half, config: ColorSegmentationConfig) -> np.ndarray:
+    """Centres of small green regions, weighted by contrast, at half resolution; (n, 3)."""
+    contrast = _contrast(half.share["green"], config)
     marks = []
     for outline in _outlines(cv2.compare(contrast, config.min_contrast, cv2.CMP_GT)):
         x, y, w, h = cv2.boundingRect(outline)
@@ -371,6 +376,6 @@ def _green_marks(
             m = cv2.moments(core)
             # Half-size pixel k covers full pixels 2k and 2k + 1.
             u, v = 2 * (x + m["m10"] / m["m00"]) + 0.5, 2 * (y + m["m01"] / m["m00"]) + 0.5
-            marks.append((area, u + origin[0], v + origin[1]))
+            marks.append((area, u + half.origin[0], v + half.origin[1]))
     marks.sort(reverse=True)
     return np.array([(u, v, area) for area, u, v in marks[:32]]).reshape(-1, 3)

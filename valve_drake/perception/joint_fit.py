@@ -17,53 +17,34 @@ import dataclasses as dc
 
 import numpy as np
 
+from valve_drake.perception.edge_profiles import Sheet, moments, normal_cdf, normal_density
 from valve_drake.perception.marker import NEXT
 
 _BEFORE = np.array([3, 0, 1, 2])
 NODES = (1 - 1 / np.sqrt(3)) / 2, (1 + 1 / np.sqrt(3)) / 2  # of a side's length, from its first corner
 # A side's own unknowns: two levels outside, two of the step, its shift, turn and bend, the blur. Common unknowns:
 # plane outside (3), plane of the step (3), four shifts (3 each), the blur; _COMMON (4, 8, 19) makes a side's of them.
+_FOUR = np.arange(4)
 _COMMON = np.zeros((4, 8, 19))
 _COMMON[:, [0, 2], [0, 3]] = _COMMON[:, 7, 18] = 1
 for _k in range(4):
     _COMMON[_k, [4, 5, 6], [6 + 3 * _k, 7 + 3 * _k, 8 + 3 * _k]] = 1
-_LEVELS, _BLUR = slice(0, 4), 7
-_BENDS = [8, 11, 14, 17]  # of the four sides among the common unknowns
+# Of the five functions of `gram`, by powers of tau: what the eight unknowns of a side and the residual are made of.
+_TERMS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2), (2, 3), (3, 0), (3, 1), (4, 0)])
+_LEVELS, _BEND, _BLUR = slice(0, 4), 6, 7
+_LITTLE = 1e-9 * np.eye(7)
 _UNEVEN = 2.5  # chi^2 per degree of freedom by which the sides' levels may contradict common planes
-_ROWS = np.arange(8)  # of the nodes
+_NODES, _ROWS = np.array(NODES), np.arange(8)  # of the nodes
 _WINDOW = 7  # half the square of pixels looked at round a corner [px]
-_SQUARE = np.mgrid[-_WINDOW : _WINDOW + 1, -_WINDOW : _WINDOW + 1][::-1].reshape(2, -1).T  # its pixels (n, 2)
+_SQUARE = np.mgrid[-_WINDOW : _WINDOW + 1, -_WINDOW : _WINDOW + 1][::-1].reshape(2, -1)  # its pixels (2, n)
 _OUTSIDE = 2.0  # of a side: pixels used at a corner [px]
 _SHORT = 2 * _WINDOW + 2  # sides below have no corner pixels of their own [px]
 _CUT = 4.5  # a pixel further from the model is not the marker's [sigma]
 _POOR = 2.5  # mean square of a corner's pixels above which it is covered or worn [sigma^2]
 _SHARPER = 0.5  # least share of the blur that one step may leave: further off the model is not linear
-_SAMPLES = 16  # points on each side that stand for it
+_EVEN = (np.arange(16) + 0.5) / 8 - 1  # tau of the points on each side that stand for it
+_ENDS, _ENDS_AND_MIDDLE = np.array([-1.0, 1.0]), np.array([-1.0, 0.0, 1.0])
 PRIOR_POINTS = 20  # how many points the noise of the grey values counts for, against the points' scatter
-
-
-@dc.dataclass(frozen=True)
-class Images:
-    """Q channels in one array: pixel (u, v) of channel q is pixels[origin[q] + wide[q] v + u]."""
-
-    pixels: np.ndarray  # (n,) float32
-    origin: np.ndarray  # (Q,)
-    wide: np.ndarray  # (Q,) [px]
-    tall: np.ndarray  # (Q,) [px]
-
-    @classmethod
-    def of(cls, channels: list[np.ndarray]) -> "Images":
-        """channels: (H, W) float32 each."""
-        size = np.array([channel.size for channel in channels])
-        return cls(
-            pixels=np.concatenate([channel.ravel() for channel in channels]),
-            origin=np.cumsum(size) - size,
-            wide=np.array([channel.shape[1] for channel in channels]),
-            tall=np.array([channel.shape[0] for channel in channels]),
-        )
-
-    def __getitem__(self, own: np.ndarray) -> "Images":
-        return Images(self.pixels, self.origin[own], self.wide[own], self.tall[own])
 
 
 @dc.dataclass(frozen=True)
@@ -77,40 +58,38 @@ class Curves:
     start: np.ndarray  # (S,)
     slope: np.ndarray  # (S,)
     coefficient: np.ndarray  # (S, 3)
+    cosine: np.ndarray  # (S,) between the image's axis across and the side's normal
 
-    def __getitem__(self, own: np.ndarray) -> "Curves":
-        return Curves(*(getattr(self, field.name)[own] for field in dc.fields(self)))
-
-    def cosine(self) -> np.ndarray:
-        return 1 / np.sqrt(1 + self.slope**2)
+    def __getitem__(self, own: np.ndarray | slice) -> "Curves":
+        return Curves(*(values[own] for values in vars(self).values()))
 
     def tau(self, t: np.ndarray) -> np.ndarray:
         """(S, n) -> (S, n): -1..1 from the first to the last profile."""
         return 2 * (t - self.first[:, None]) / (self.count[:, None] - 1.0) - 1
 
-    def across(self, t: np.ndarray) -> np.ndarray:
-        """(S, n) -> (S, n) [px]"""
-        tau = self.tau(t)
+    def across(self, t: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        """(S, n), and the same as `tau` -> (S, n) [px]"""
         c = self.coefficient.T[:, :, None]
         return (self.start[:, None] + c[0] - c[2] / 3) + self.slope[:, None] * t + tau * (c[1] + tau * c[2])
 
-    def points(self, t: np.ndarray) -> np.ndarray:
-        """(S, n) -> (S, n, 2) [px]"""
-        y, flat = self.across(t), self.flat[:, None]
+    def points(self, tau: np.ndarray) -> np.ndarray:
+        """(n,) -> (S, n, 2) [px]"""
+        t = self.first[:, None] + (self.count[:, None] - 1) * ((tau + 1) / 2)
+        y, flat = self.across(t, tau), self.flat[:, None]
         out = np.empty((*y.shape, 2))
         out[..., 0], out[..., 1] = np.where(flat, t, y), np.where(flat, y, t)
         return out
 
     def normals(self) -> np.ndarray:
         """(S, 2) unit, inward, at the middle."""
-        both = np.stack([-self.slope, np.ones_like(self.slope)], -1) * (self.inward * self.cosine())[:, None]
+        both = np.stack([-self.slope, np.ones_like(self.slope)], -1) * (self.inward * self.cosine)[:, None]
         return np.where(self.flat[:, None], both, both[:, ::-1])
 
 
 def basis(tau: np.ndarray) -> np.ndarray:
-    """1, tau, and a bend that is nil at Gauss's nodes of -1..1."""
-    out = np.empty((*tau.shape, 3))
-    out[..., 0], out[..., 1], out[..., 2] = 1, tau, tau * tau - 1 / 3
+    """1, tau, and a bend that is nil at Gauss's nodes of -1..1: (..., n) -> (..., 3, n)."""
+    out = np.empty((*tau.shape[:-1], 3, tau.shape[-1]))
+    out[..., 0, :], out[..., 1, :], out[..., 2, :] = 1, tau, tau * tau - 1 / 3
     return out
 
 
@@ -123,44 +102,29 @@ class Sums:
     square: np.ndarray  # (S,) of the residuals
     pixels: np.ndarray  # (S,)
 
-    def __getitem__(self, own: np.ndarray) -> "Sums":
-        return Sums(*(getattr(self, field.name)[own] for field in dc.fields(self)))
+    def __getitem__(self, own: np.ndarray | slice) -> "Sums":
+        return Sums(*(values[own] for values in vars(self).values()))
 
 
-def sums(
-    weight: np.ndarray,
-    good: np.ndarray,
-    rise: np.ndarray,
-    gain: np.ndarray,
-    z: np.ndarray,
-    residual: np.ndarray,
-    tau: np.ndarray,
-) -> Sums:
-    """weight, rise, gain, z, residual: (S, N, M) of each pixel; good, tau (S, N) of each profile."""
-    S, N, M = weight.shape
-    values = np.empty((S, 9, N, M), np.float32)  # the eight functions of a side, and the residual, by the weight's root
-    root = values[:, 0]
-    weight = weight * good.astype(np.float32)[:, :, None]
-    np.sqrt(weight, out=root)
-    for k, function in ((2, rise), (4, -gain), (8, residual)):
-        np.multiply(function, root, out=values[:, k])
-    by_tau = tau.astype(np.float32)[:, :, None]
-    np.multiply(values[:, :6:2], by_tau[:, None], out=values[:, 1:6:2])
-    np.multiply(values[:, 4], by_tau * by_tau - np.float32(1 / 3), out=values[:, 6])
-    np.multiply(values[:, 4], z, out=values[:, 7])
-    values = values.reshape(S, 9, -1)
-    # All but the first with itself: BLAS takes four times as long for a matrix by its own transpose.
-    products = np.empty((S, 9, 9))
-    products[:, 1:] = values[:, 1:] @ values.transpose(0, 2, 1)
-    products[:, 0, 1:] = products[:, 1:, 0]
-    products[:, 0, 0] = weight.sum((1, 2), dtype=float)
-    return Sums(
-        normal=products[:, :8, :8], right=products[:, :8, 8], square=products[:, 8, 8], pixels=products[:, 0, 0]
-    )
+def sums(products: np.ndarray, good: np.ndarray, tau: np.ndarray, level: np.ndarray, blur: np.ndarray) -> Sums:
+    """products (S, 15, N): see `gram`; good, tau (S, N) of each profile; level (S, 4), blur (S,) it is linear about."""
+    b0, b1, h0, h1 = level.T
+    g0, g1 = h0 / blur, h1 / blur
+    # The eight functions of a side, and the residual, in terms of _TERMS.
+    F = np.zeros((len(tau), 9, len(_TERMS)))
+    F[:, _FOUR, _FOUR] = F[:, 8, 10] = 1
+    F[:, 4, 4] = F[:, 5, 5] = F[:, 6, 6] = -g0
+    F[:, 4, 5] = F[:, 5, 6] = F[:, 6, 7] = -g1
+    F[:, 6, 4], F[:, 6, 5] = g0 / 3, g1 / 3
+    F[:, 7, 8], F[:, 7, 9] = -g0, -g1
+    F[:, 8, :4] = -level
+    both = F @ moments(products, good, tau, _TERMS) @ F.transpose(0, 2, 1)
+    pixels = (products[:, 0] * good).sum(1)
+    return Sums(normal=both[:, :8, :8], right=both[:, :8, 8], square=both[:, 8, 8], pixels=pixels)
 
 
 def joint_fit(
-    images: Images,
+    sheet: Sheet,
     curves: Curves,
     level: np.ndarray,
     blur: np.ndarray,
@@ -172,13 +136,13 @@ def joint_fit(
     straight lines go once they are undistorted; and the information (8, 8) [1/px^2] of the distances inward of the
     sides at NODES.
 
-    images of the Q channels; curves of their 4 Q sides, level (4 Q, 4) the sides' own levels; blur (Q,); seen,
+    sheet of the Q channels; curves of their 4 Q sides, level (4 Q, 4) the sides' own levels; blur (Q,); seen,
     bend (4 Q,): prior on each bend; scatter (Q, 2): chi^2 of the edge points about their sides times sigma^2, and its
     degrees of freedom. None where the light is not that of two planes, there are too few pixels to tell, the sides do
     not meet, or the blur was far off.
     """
     Q = len(blur)
-    middle = curves.points(curves.first[:, None] + (curves.count[:, None] - 1) * np.array([0.0, 0.5, 1.0]))
+    middle = curves.points(_ENDS_AND_MIDDLE)
     halves = middle[:, 1].reshape(Q, 4, 2)
     centre, size = halves.sum(1) / 4, (halves.max(1) - halves.min(1)).max(1)
     place = (middle.reshape(Q, 4, 3, 2) - centre[:, None, None]) / size[:, None, None, None]
@@ -193,22 +157,23 @@ def joint_fit(
     off[:, _LEVELS] = level[:, :, None] - (to_levels @ planes).reshape(4 * Q, 4, 1)
     planes = planes[:, :, 0]
     right = seen.right + (seen.normal @ off)[:, :, 0]
+    normal = seen.normal.copy()
+    normal[:, _BEND, _BEND] += bend
     flat_T = T.reshape(Q, 32, 19)
     back = flat_T.transpose(0, 2, 1)
-    H = back @ (seen.normal.reshape(Q, 4, 8, 8) @ T).reshape(Q, 32, 19)
-    H[:, _BENDS, _BENDS] += bend.reshape(Q, 4)
+    H = back @ (normal.reshape(Q, 4, 8, 8) @ T).reshape(Q, 32, 19)
     b = back @ right.reshape(Q, 32, 1)
     step = np.linalg.solve(H, b)
     lost = (off[:, :, 0] * (seen.right + right)).reshape(Q, 32).sum(1) - (b * step).sum((1, 2))
     step = step[:, :, 0]
 
-    apart = _apart(seen, bend)
+    apart = _apart(normal, seen.right)
     freedom = seen.pixels.reshape(Q, 4).sum(1) - 29
     variance = (seen.square.reshape(Q, 4).sum(1) + apart) / np.maximum(freedom, 1)
     fits = (freedom >= 30) & (lost > apart) & (lost - apart < 10 * _UNEVEN * variance)
     fits &= 1 + step[:, 18] / blur > _SHARPER
 
-    per_shift = (curves.inward / curves.cosine())[:, None]
+    per_shift = (curves.inward / curves.cosine)[:, None]
 
     def moved(step: np.ndarray) -> Curves:
         return dc.replace(curves, coefficient=curves.coefficient + step[:, 6:18].reshape(4 * Q, 3) * per_shift)
@@ -216,51 +181,54 @@ def joint_fit(
     final = moved(step)
     ends = _corners(final)
     fits &= np.isfinite(ends).all((1, 2))
-    long = fits & (((ends[:, NEXT] - ends) ** 2).sum(2).min(1) > _SHORT**2)
-    if long.any():
+    long = np.flatnonzero(fits & (((ends[:, NEXT] - ends) ** 2).sum(2).min(1) > _SHORT**2))
+    if len(long):
         light = planes + step[:, :6]
-        J, r, owner = _corner_pixels(images, final, ends, light, blur + step[:, 18], (centre, size), variance, long)
-        for q in np.flatnonzero(long):
-            own = J[owner == q]
-            H[q] += own.T @ own
-            step[q] += np.linalg.solve(H[q], own.T @ r[owner == q])
+        J, r, owner = _corner_pixels(sheet, final, ends, light, blur + step[:, 18], (centre, size), variance, long)
+        g = np.zeros((Q, 19, 1))
+        for q in long:
+            own = slice(*np.searchsorted(owner, [q, q + 1]))
+            H[q] += J[own].T @ J[own]
+            g[q, :, 0] = J[own].T @ r[own]
+        step[long] += np.linalg.solve(H[long], g[long])[:, :, 0]
         final = moved(step)
-        ends = _corners(final)
     begin, stop = ends.reshape(-1, 2), ends[:, NEXT].reshape(-1, 2)
     begin, stop = (np.where(final.flat, p[:, 0], p[:, 1]) for p in (begin, stop))
-    t = begin[:, None] + (stop - begin)[:, None] * np.array(NODES)
+    t = begin[:, None] + (stop - begin)[:, None] * _NODES
     K = np.zeros((Q, 8, 19))  # undistorted, none has a bend
     K[:, _ROWS, _ROWS // 2 * 3 + 6], K[:, _ROWS, _ROWS // 2 * 3 + 7] = 1, final.tau(t).reshape(Q, 8)
-    even = final.points(curves.first[:, None] + (curves.count[:, None] - 1) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES)
+    even = final.points(_EVEN)
     # What pixels know of an edge's place goes with the inverse of its blur, and H is of the blur before the step.
     wider = 1 + step[:, 18] / blur
+    fits &= wider > _SHARPER
+    chi2, n = scatter.T
+    noise = wider * (chi2 + PRIOR_POINTS * variance) / (n + PRIOR_POINTS)
     out: list[tuple[np.ndarray, np.ndarray] | None] = [None] * Q
-    for q in np.flatnonzero(fits & (wider > _SHARPER)):
-        chi2, n = scatter[q]
-        spread = wider[q] * (chi2 / variance[q] + PRIOR_POINTS) / (n + PRIOR_POINTS)
-        covariance = variance[q] * spread * (K[q] @ np.linalg.solve(H[q], K[q].T))
-        out[q] = even[4 * q : 4 * q + 4], np.linalg.inv(covariance)
+    if fits.any():
+        of_nodes = K[fits] @ np.linalg.solve(H[fits], K[fits].transpose(0, 2, 1))
+        information = np.linalg.inv(noise[fits, None, None] * of_nodes)
+        for q, one in zip(np.flatnonzero(fits), information):
+            out[q] = even[4 * q : 4 * q + 4], one
     return out
 
 
-def _apart(seen: Sums, bend: np.ndarray) -> np.ndarray:
-    """By how much each quadrilateral's sum of squares falls if every side has its own levels (Q,), negative."""
-    own = np.arange(7)
-    N = seen.normal[:, :7, :7].copy()
-    N[:, own, own] += 1e-9
-    N[:, 6, 6] += bend
-    both = np.empty((len(bend), 7, 2))
-    both[:, :, 0], both[:, :, 1] = seen.right[:, :7], seen.normal[:, :7, _BLUR]
-    products = both.transpose(0, 2, 1) @ np.linalg.solve(N, both)
+def _apart(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """By how much each quadrilateral's sum of squares falls if every side has its own levels (Q,), negative.
+
+    normal (S, 8, 8) with the prior on the bend, right (S, 8).
+    """
+    both = np.empty((len(right), 7, 2))
+    both[:, :, 0], both[:, :, 1] = right[:, :7], normal[:, :7, _BLUR]
+    products = both.transpose(0, 2, 1) @ np.linalg.solve(normal[:, :7, :7] + _LITTLE, both)
     fall = products[:, 0, 0].reshape(-1, 4).sum(1)
-    g = (seen.right[:, _BLUR] - products[:, 1, 0]).reshape(-1, 4).sum(1)
-    h = (seen.normal[:, _BLUR, _BLUR] - products[:, 1, 1]).reshape(-1, 4).sum(1)
+    g = (right[:, _BLUR] - products[:, 1, 0]).reshape(-1, 4).sum(1)
+    h = (normal[:, _BLUR, _BLUR] - products[:, 1, 1]).reshape(-1, 4).sum(1)
     return -(fall + g * g / h)
 
 
 def _corners(curves: Curves) -> np.ndarray:
     """Where the sides of Q quadrilaterals meet, (Q, 4, 2) [px]."""
-    ends = curves.points(curves.first[:, None] + (curves.count[:, None] - 1) * np.array([0.0, 1.0]))
+    ends = curves.points(_ENDS)
     d = ends[:, 1] - ends[:, 0]
     lines = np.empty((len(d), 3))
     lines[:, 0], lines[:, 1] = -d[:, 1], d[:, 0]
@@ -280,51 +248,49 @@ def meet(lines: np.ndarray) -> np.ndarray:
 
 
 def _corner_pixels(
-    images: Images,
+    sheet: Sheet,
     curves: Curves,
     ends: np.ndarray,
     planes: np.ndarray,
     blur: np.ndarray,
     frame: tuple[np.ndarray, np.ndarray],
     variance: np.ndarray,
-    wanted: np.ndarray,
+    quads: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Jacobian (n, 19) and residual (n,) of the pixels at the corners that no profile holds, and whose they are (n,).
 
-    wanted (Q,): the quadrilaterals whose pixels are looked for.
+    quads: the numbers of those looked at, in order.
     """
-    Q = len(ends)
-    quads = np.flatnonzero(wanted)
-    corners = (4 * quads[:, None] + np.arange(4)).ravel()  # numbers among all 4 Q
+    corners = (4 * quads[:, None] + _FOUR).ravel()  # numbers among all 4 Q
     before = (4 * quads[:, None] + _BEFORE).ravel()
     C = len(corners)
-    px = np.rint(ends.reshape(4 * Q, 2)[corners]).astype(int)[:, None] + _SQUARE  # (C, n, 2)
+    u, v = np.rint(ends.reshape(-1, 2)[corners]).astype(int).T[:, :, None] + _SQUARE[:, None]  # (C, n)
     sides = curves[np.concatenate([corners, before])]  # those that begin at the corners, then those that end there
-    flat, first = sides.flat[:, None], sides.first[:, None]
-    u, v = np.concatenate([px, px]).transpose(2, 0, 1)
-    t, y = np.where(flat, u, v), np.where(flat, v, u)  # (2 C, n)
-    gap = (y - sides.across(t)) * (sides.inward * sides.cosine())[:, None]
+    flat, first = sides.flat.reshape(2, C, 1), sides.first[:, None]
+    t, y = (np.where(flat, *both).reshape(2 * C, -1) for both in ((u, v), (v, u)))
+    tau = sides.tau(t)
+    gap = (y - sides.across(t, tau)) * (sides.inward * sides.cosine)[:, None]
     beyond = (t < first) | (t >= first + sides.count[:, None])
     near, far = np.minimum(gap[:C], gap[C:]), np.maximum(gap[:C], gap[C:])
-    u, v = u[:C], v[:C]
     of = corners // 4
-    keep = (u >= 0) & (v >= 0) & (u < images.wide[of, None]) & (v < images.tall[of, None])
+    (low_u, low_v), (high_u, high_v) = sheet.low[of].T[:, :, None], sheet.high[of].T[:, :, None]
+    keep = (u >= low_u) & (v >= low_v) & (u <= high_u) & (v <= high_v)
     keep &= beyond[:C] & beyond[C:] & (near > -_OUTSIDE) & (far > -1) & (near < 4)
     kept = np.flatnonzero(keep)
-    row = kept // len(_SQUARE)
+    row = kept // u.shape[1]
     corner, behind = corners[row], before[row]
     q = of[row]
-    px = px.reshape(-1, 2)[kept]
+    u, v = u.ravel()[kept], v.ravel()[kept]
     b, a = gap.reshape(2, -1)[:, kept] / blur[q]
-    along = basis(sides.tau(t).reshape(2, -1)[:, kept])
+    along = basis(tau.reshape(2, -1)[:, kept]).transpose(0, 2, 1)
     normals = curves.normals()
-    rho = (normals[behind] * normals[corner]).sum(1)
+    rho = (normals[before] * normals[corners]).sum(1)[row]
     cover, by_a, by_b = _wedge(a, b, rho)
 
-    n = len(px)
-    place = np.empty((n, 3))
-    place[:, 0] = 1
-    place[:, 1:] = (px - frame[0][q]) / frame[1][q, None]
+    n = len(kept)
+    place = np.ones((n, 3))
+    (middle_u, middle_v), size = frame[0][q].T, frame[1][q]
+    place[:, 1], place[:, 2] = (u - middle_u) / size, (v - middle_v) / size
     light = planes[q]
     height = (place * light[:, 3:]).sum(1)
     J = np.zeros((n, 19))
@@ -337,7 +303,7 @@ def _corner_pixels(
         shifts[rows, side] = (scaled * slope)[:, None] * values
     J[:, 6:18] = shifts.reshape(n, 12)
     J[:, 18] = scaled * (a * by_a + b * by_b)
-    value = images.pixels[images.origin[q] + px[:, 1] * images.wide[q] + px[:, 0]]
+    value = sheet.pixels[v, u]
     r = value - (place * light[:, :3]).sum(1) - height * cover
     chi2 = r * r / variance[q]
     good = chi2 < _CUT**2
@@ -351,28 +317,8 @@ def _wedge(a: np.ndarray, b: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, n
     """P(x < a, y < b) of the bivariate normal distribution, to 1e-3 for |rho| < 0.5, and its exact derivatives."""
     root = np.sqrt(1 - rho**2)
     at = np.stack([a, b, (b - rho * a) / root, (a - rho * b) / root])
-    density = _density(at)
+    density = normal_density(at)
     cdf = normal_cdf(at, density)
     series = 1 + rho / 2 * a * b + rho**2 / 6 * (a * a - 1) * (b * b - 1)
     cover = cdf[0] * cdf[1] + rho * density[0] * density[1] * series
     return cover, density[0] * cdf[2], density[1] * cdf[3]
-
-
-def _density(z: np.ndarray) -> np.ndarray:
-    return np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
-
-
-def normal_cdf(z: np.ndarray, density: np.ndarray | None = None) -> np.ndarray:
-    """Phi(z), its density given or not (Abramowitz and Stegun 26.2.17, error < 8e-8)."""
-    density = _density(z) if density is None else density
-    u = np.abs(z)
-    u *= 0.2316419
-    u += 1
-    np.reciprocal(u, out=u)
-    tail = u * 1.330274429
-    for c in (-1.821255978, 1.781477937, -0.356563782, 0.319381530):
-        tail += c
-        tail *= u
-    tail *= density
-    np.subtract(0.5, tail, out=tail)
-    return np.copysign(tail, z, out=tail) + z.dtype.type(0.5)

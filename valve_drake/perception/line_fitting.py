@@ -22,13 +22,16 @@ import numpy as np
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require_in
 from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, SegmentationPair
-from valve_drake.perception.color_segmentation import every, polygon_area
-from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, Images, basis, joint_fit, meet, normal_cdf, sums
+from valve_drake.perception.color_segmentation import every
+from valve_drake.perception.edge_profiles import ROW, Sheet, gram, moments, normal_cdf, normal_density
+from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, basis, joint_fit, meet, sums
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig, match, single, wrong_size
 
-# Of the functions 1, tau, rise, tau rise, bell, tau bell. A short side shows no trend: it is held near zero there.
+# 1, tau, rise, tau rise, bell, tau bell, and the grey value. A short side shows no trend: it is held near zero there.
+_LEVEL_TERMS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (4, 0)])
 _LEVEL_PRIOR = np.diag([1e-9, 0.1, 1e-9, 0.1, 1e-6, 1e-6])
+_CURVE_PRIOR, _BEND = np.diag([1e-9, 1e-9, 0.0]), np.diag([0.0, 0.0, 1.0])
 _FOUR = np.arange(4)
 _REACH = 4.5  # half a profile's length that holds a blurred step [blur]
 _PAD = 12  # least room round the quadrilateral [px]
@@ -38,7 +41,8 @@ _ONE_HUE = 0.96  # least cosine between the marker's colour in the shadow and in
 _TWO_LEVELS = 0.25  # share of that variance which two lights leave unexplained at most
 _LEAST_HALF = 2  # half a profile's length at a side's ends, where the light plate is narrowest [px] ...
 _LEAN = 2.5  # ... and the pixels along the side that it needs for one more
-_ENOUGH = 30  # profiles of a side that find the way to its edge
+_ENOUGH = 20  # profiles of a side that find the way to its edge
+_GROWN = np.array([0.75, 1.14, 1.3])  # the marker's inside, and a ring of its surroundings, over its size
 _SHARP = 0.8  # blur that is looked for first: a lens in focus, and the pixel itself [px]
 
 
@@ -98,7 +102,7 @@ def fit_pair(
         chosen = [single(seen.candidates, lens, marker, matching) for seen, lens in cameras]
         if min(chosen) >= 0:  # both see one, but not the same: neither can be trusted
             chosen = [-1, -1]
-    quads = [QuadEdges(reason=found.reason)] * 2
+    quads: list[QuadEdges | None] = [None, None]
     used = [k for k in (0, 1) if chosen[k] >= 0]
     candidates = [cameras[k][0].candidates[chosen[k]] for k in used]
     images = [cameras[k][0].frame.image for k in used]
@@ -106,6 +110,7 @@ def fit_pair(
     for k, candidate, one in zip(used, candidates, raw):
         seen, lens = cameras[k]
         quads[k] = _edges_of(one, candidate, seen.green, lens, config.max_sigma)
+    quads = [quad or QuadEdges(reason=found.reason) for quad in quads]
     reason = ""
     if quads[0].found and quads[1].found:
         reason = wrong_size(quads[0].corners, quads[1].corners, head, marker, matching)
@@ -124,14 +129,13 @@ def _edges_of(
         return QuadEdges(reason=raw.reason, center_px=candidate.center)
     n = len(raw.points)
     if raw.together is None:
-        points = lens.normalize(raw.points)
-        lines, off = side_lines(points, raw.side)
-        scatter = off * lens.focal()
+        points, side, own = lens.normalize(raw.points), raw.side, 0.0
     else:
-        on_each = raw.together.shape[1]
         points = lens.normalize(np.concatenate([raw.points, raw.together.reshape(-1, 2)]))
-        lines, off = side_lines(points[n:], np.arange(4 * on_each) // on_each)
-        scatter = math.hypot(off * lens.focal(), raw.sigma)  # these are on the curves that the points scatter about
+        side = np.repeat(_FOUR, raw.together.shape[1])
+        own = raw.sigma  # these are on the curves that the points scatter about
+    lines, off = side_lines(points[-len(side) :], side)
+    scatter = math.hypot(off * lens.focal(), own)
     corners = meet(lines)
     if not np.isfinite(corners).all():
         return QuadEdges(reason="sides do not meet", center_px=candidate.center)
@@ -155,79 +159,84 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: LineF
 
     Corners go clockwise as seen. All are fitted in one pass, which costs little more than one.
     """
-    out: list[RawQuad] = []
-    parts = []
-    for k, (image, near) in enumerate(zip(images, corners)):
-        pad = max(_PAD, int(0.1 * np.ptp(near, axis=0).max()))  # the ring that `_mix` looks at grows with the marker
-        low = np.maximum(np.floor(near.min(0)).astype(int) - pad, 0)
-        high = np.minimum(np.ceil(near.max(0)).astype(int) + pad + 1, [image.shape[1], image.shape[0]])
-        out.append(RawQuad(reason="outside of the image"))
+    out = [RawQuad(reason="outside of the image")] * len(images)
+    channels, lows, near, number = [], [], [], []
+    for k, (image, start) in enumerate(zip(images, corners)):
+        least, most = start.min(0), start.max(0)
+        pad = max(_PAD, int(0.1 * (most - least).max()))  # the ring that `_mix` looks at grows with the marker
+        low = np.maximum(np.floor(least).astype(int) - pad, 0)
+        high = np.minimum(np.ceil(most).astype(int) + pad + 1, [image.shape[1], image.shape[0]])
         if (high - low < 6).any():
             continue
-        channel, contrast = _mix(image[low[1] : high[1], low[0] : high[0]], near - low, config)
+        channel, contrast = _mix(image[low[1] : high[1], low[0] : high[0]], start - low, config)
         if contrast < config.min_contrast:
             out[k] = RawQuad(reason=f"contrast: {contrast:.0f}")
             continue
-        coarse = _hough_corners(channel, near - low)
-        sides = _place(channel, coarse, config)
-        if isinstance(sides, str):
-            out[k] = RawQuad(reason=sides)
-        else:
-            parts.append((k, low, coarse, sides))
-    if parts:
-        for (k, low, coarse, sides), raw in zip(parts, _fit_sides([part[-1] for part in parts], config)):
-            if int(_REACH * raw.blur) > sides.half:
-                # A step that reaches beyond its profiles is fitted once more, to longer ones.
-                wide = _place(sides.channel, coarse, config, _REACH * raw.blur)
-                if not isinstance(wide, str) and wide.half > sides.half:
-                    raw = _fit_sides([wide], config)[0]
-            together = None if raw.together is None else raw.together + low
-            out[k] = raw if raw.reason else dc.replace(raw, points=raw.points + low, together=together)
+        for values, value in ((channels, channel), (lows, low), (near, start - low), (number, k)):
+            values.append(value)
+    if not number:
+        return out
+    sheet = Sheet.of(channels)
+    coarse = _hough_corners(sheet, np.array(near) + sheet.low[:, None])
+    sides, reasons = _place(sheet, coarse, config)
+    fits = np.array([not reason for reason in reasons])
+    own = _where(fits)
+    fitted = iter(_fit_sides(sheet[own], sides[own], config) if fits.any() else ())
+    for q, k in enumerate(number):
+        raw = next(fitted) if fits[q] else RawQuad(reason=reasons[q])
+        if int(_REACH * raw.blur) > sides.half[q]:
+            # A step that reaches beyond its profiles is fitted once more, to longer ones.
+            one = slice(q, q + 1)
+            wide, (reason,) = _place(sheet[one], coarse[one], config, _REACH * raw.blur)
+            if not reason and wide.half[0] > sides.half[q]:
+                raw = _fit_sides(sheet[one], wide, config)[0]
+        if not raw.reason:
+            back = lows[q] - sheet.low[q]
+            together = None if raw.together is None else raw.together + back
+            raw = dc.replace(raw, points=raw.points + back, together=together)
+        out[k] = raw
     return out
 
 
-def side_lines(points: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]:
-    """Total-least-squares lines: (4, 3) with unit normals, l . (x, y, 1) = 0, and the rms distance of the points.
+def side_lines(points: np.ndarray, side: np.ndarray, sides: int = 4) -> tuple[np.ndarray, float]:
+    """Total-least-squares lines: (sides, 3) with unit normals, l . (x, y, 1) = 0, and the rms distance of the points.
 
-    points (n, 2), side (n,) 0..3. A side without two points gives NaN.
+    points (n, 2), side (n,) 0..sides - 1. A side without two points gives NaN.
     """
     middle = points.sum(0) / max(len(points), 1)
-    x, y = (points - middle).T
-    own = (np.asarray(side)[:, None] == _FOUR).astype(float)
-    n, sx, sy, sxx, sxy, syy = np.array([np.ones(len(x)), x, y, x * x, x * y, y * y]) @ own
+    terms = np.empty((6, len(points)))
+    terms[0] = 1
+    x, y = np.subtract(points.T, middle[:, None], out=terms[1:3])
+    np.multiply(x, terms[1:3], out=terms[3:5])
+    np.multiply(y, y, out=terms[5])
+    n, sx, sy, sxx, sxy, syy = terms @ (np.asarray(side)[:, None] == np.arange(sides)).astype(float)
     safe = np.maximum(n, 1)
     mean_x, mean_y = sx / safe, sy / safe
     xx, xy, yy = sxx - sx * mean_x, sxy - sx * mean_y, syy - sy * mean_y
     angle = np.arctan2(2 * xy, xx - yy) / 2  # of the side's direction
-    lines = np.empty((4, 3))
+    lines = np.empty((sides, 3))
     c, s = np.cos(angle), np.sin(angle)
     lines[:, 0], lines[:, 1] = -s, c
     lines[:, 2] = s * (mean_x + middle[0]) - c * (mean_y + middle[1])
     square = float((s * s * xx - 2 * s * c * xy + c * c * yy).sum())
-    lines[n < 2] = np.nan
-    return lines, math.sqrt(max(square, 0.0) / max(len(points) - 8, 1))
+    if n.min() < 2:
+        lines[n < 2] = np.nan
+    return lines, math.sqrt(max(square, 0.0) / max(len(points) - 2 * sides, 1))
 
 
 def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tuple[np.ndarray, float]:
     """One linear channel, float32: about 1 inside, about 0 outside; and the contrast it has [grey levels]."""
-    step = _step(corners)
+    step = 2 if (corners.max(0) - corners.min(0)).max() > _LARGE else 1
     small, corners = every(part, step), corners / step
     if config.gamma != 1.0:
         table = (255 * (np.arange(256) / 255) ** config.gamma).astype(np.float32)
-        part, small = table[part], table[small]
-    else:
-        part, small = part.astype(np.float32), small.astype(np.float32)
-    middle = corners.mean(0)
-
-    def grown(factor: float) -> np.ndarray:
-        mask = np.zeros(small.shape[:2], np.uint8)
-        shape = ((middle + factor * (corners - middle)) * 16).round().astype(np.int32)
-        return cv2.fillConvexPoly(mask, shape, 255, shift=4)
-
-    inside = grown(0.75)
+        part, small = cv2.LUT(part, table), cv2.LUT(small, table)
+    middle = corners.sum(0) / 4
+    grown = ((middle + _GROWN[:, None, None] * (corners - middle)) * 16 + 0.5).astype(np.int32)
+    inside, near, far = (cv2.fillConvexPoly(np.zeros(small.shape[:2], np.uint8), c, 255, shift=4) for c in grown)
     part, small = _even_light(part, small, inside, step)
     core = np.array(cv2.mean(small, inside)[:3])
-    ring = np.array(cv2.mean(small, cv2.subtract(grown(1.3), grown(1.14)))[:3])
+    ring = np.array(cv2.mean(small, cv2.subtract(far, near))[:3])
     difference = core - ring
     if config.color_only:
         difference = difference - difference.mean()
@@ -235,16 +244,11 @@ def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tu
     if contrast < 1e-3:
         return part[:, :, 0], 0.0
     w = difference / (difference @ (core - ring))
-    return cv2.transform(part, np.array([[*w, -w @ ring]], np.float32)), contrast
-
-
-def _step(corners: np.ndarray) -> int:
-    """Every how many-th pixel tells the colours and the coarse lines of a quadrilateral (4, 2)."""
-    return 2 if np.ptp(corners, axis=0).max() > _LARGE else 1
+    return cv2.transform(part.astype(np.float32), np.array([[*w, -w @ ring]], np.float32)), contrast
 
 
 def _even_light(part: np.ndarray, small: np.ndarray, inside: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """The image (H, W, 3) float32 as if all of it were in the light, if a shadow's edge crosses the marker.
+    """The image (H, W, 3) as if all of it were in the light, if a shadow's edge crosses the marker.
 
     small, and what is returned second: every step-th pixel of it; inside: mask of the marker's inside in it. It is of
     one colour, so two levels on either side of a straight edge are two lights. The edge is taken to go on straight
@@ -290,231 +294,256 @@ def _even_light(part: np.ndarray, small: np.ndarray, inside: np.ndarray, step: i
     return part, every(part, step)
 
 
-def _hough_corners(channel: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Corners from the strongest Hough lines near the four sides, each moved to the mean of the edge pixels by it.
+def _hough_corners(sheet: Sheet, corners: np.ndarray) -> np.ndarray:
+    """Corners (Q, 4, 2) from the strongest Hough lines near the sides, each moved to the mean of the edge pixels by it.
 
     A side without such a line (a wide-angle lens bends long ones) starts from its coarse one.
     """
-    step = _step(corners)
-    coarse, corners, channel = corners, corners / step, every(channel, step)
-    gray = cv2.convertScaleAbs(cv2.max(channel, 0.0), alpha=255)
+    Q = len(corners)
+    step = 2 if (corners.max(1) - corners.min(1)).max(1).min() > _LARGE else 1
+    coarse, corners = corners, corners / step
+    gray = cv2.convertScaleAbs(cv2.max(every(sheet.pixels, step), 0.0), alpha=255)
     edges = cv2.Canny(gray, 60, 120)
     band = np.zeros(edges.shape, np.uint8)
-    cv2.polylines(band, [(corners * 16).round().astype(np.int32)], True, 255, 7, shift=4)
-    ends = corners[NEXT]
-    along = ends - corners
-    lengths = np.sqrt((along * along).sum(1))
-    votes = max(int(0.35 * lengths.min()), 4)
-    turn = min(max(4 / lengths.max(), np.pi / 180), np.pi / 45)  # a pixel either way at the ends of a side
+    cv2.polylines(band, list((corners * 16).round().astype(np.int32)), True, 255, 7, shift=4)
     edges = cv2.bitwise_and(edges, band)
-    found = cv2.HoughLines(edges, 1.0, turn, votes)
-    direction = along / lengths[:, None]
-    lines = np.empty((4, 3))
-    lines[:, 0], lines[:, 1] = -direction[:, 1], direction[:, 0]
-    lines[:, 2] = -(lines[:, :2] * corners).sum(1)
-    reach = np.full(4, 3.5)
-    if found is not None:
-        rho, theta = found[:, 0].astype(float).T
-        all_lines = np.stack([np.cos(theta), np.sin(theta), -rho], -1)
-        turned = np.abs(all_lines[:, :2] @ direction.T)  # (lines, 4)
-        off = np.abs(all_lines[:, :2] @ ((corners + ends) / 2).T - rho[:, None])
-        near = (turned < 0.2 + 2 / lengths) & (off < 3.0)
-        best, seen = near.argmax(0), near.any(0)  # the most votes come first
-        lines[seen], reach[seen] = all_lines[best[seen]], 2.0
     pixels = cv2.findNonZero(edges)
     if pixels is None:
         return coarse
+    ends = corners[:, NEXT].reshape(-1, 2)
+    begin = corners.reshape(-1, 2)
+    along = ends - begin
+    lengths = np.sqrt((along * along).sum(1))  # (4 Q,), as all that is of a side
+    shortest, longest = lengths.reshape(Q, 4).min(1), lengths.reshape(Q, 4).max(1)
+    found, of_line = [], []
+    for q in range(Q):
+        first = int(sheet.low[q, 0]) // step
+        part = edges[:, first : int(sheet.high[q, 0]) // step + 1]
+        turn = min(max(4 / longest[q], np.pi / 180), np.pi / 45)  # a pixel either way at the ends of a side
+        seen = cv2.HoughLines(part, 1.0, turn, max(int(0.35 * shortest[q]), 4))
+        if seen is not None:
+            seen[:, 0, 0] += first * np.cos(seen[:, 0, 1])
+            found.append(seen[:, 0])
+            of_line += [q] * len(seen)
+    lines = np.empty((4 * Q, 3))
+    lines[:, 0], lines[:, 1] = -along[:, 1] / lengths, along[:, 0] / lengths
+    lines[:, 2] = -(lines[:, :2] * begin).sum(1)
+    reach = np.full(4 * Q, 3.5)
+    of_side = np.arange(4 * Q) // 4
+    if found:
+        rho, theta = np.concatenate(found).astype(float).T
+        voted = np.stack([np.cos(theta), np.sin(theta), -rho], 1)
+        turned = np.abs(voted[:, :2] @ (along / lengths[:, None]).T)  # (lines, 4 Q)
+        off = np.abs(voted[:, :2] @ ((begin + ends) / 2).T - rho[:, None])
+        near = (turned < 0.2 + 2 / lengths) & (off < 3.0) & (np.array(of_line)[:, None] == of_side)
+        best, seen = near.argmax(0), near.any(0)  # the most votes come first
+        lines[seen], reach[seen] = voted[best[seen]], 2.0
     pixels = pixels[:, 0].astype(float)
+    of_pixel = (pixels[:, :1] >= sheet.low[1:, 0] / step).sum(1)
     off = np.abs(pixels @ lines[:, :2].T + lines[:, 2])
+    off[of_pixel[:, None] != of_side] = np.inf
     side = off.argmin(1)
     by = off[np.arange(len(off)), side] < reach[side]
-    lines = side_lines(pixels[by], side[by])[0]
-    refined = step * meet(lines)
-    ok = np.isfinite(refined).all() and np.abs(refined - coarse).max() < 4 + 0.05 * step * lengths.max()
-    return refined if ok else coarse
+    lines = side_lines(pixels[by], side[by], 4 * Q)[0]
+    refined = step * meet(lines.reshape(Q, 4, 3))
+    ok = np.abs(refined - coarse).max((1, 2)) < 4 + 0.05 * step * longest
+    return np.where(ok[:, None, None], refined, coarse)
 
 
 @dc.dataclass(frozen=True)
 class _Sides:
-    """The profiles of four sides before the fit: everything (4, ...) or (4,)."""
+    """The profiles of the four sides of Q quadrilaterals before the fit: everything (Q, 4), half (Q,)."""
 
-    channel: np.ndarray  # (H, W) float32
     flat: np.ndarray  # profiles are columns of the image (t is u), else rows (t is v)
     first: np.ndarray  # t of the first profile
     count: np.ndarray  # profiles
     start: np.ndarray  # position across the side at t = 0 ...
     slope: np.ndarray  # ... and its change with t
     inward: np.ndarray  # +-1: the way across the side that leads inside
-    half: int  # of a profile [px]
+    half: np.ndarray  # of a profile [px]
+
+    def __getitem__(self, own: np.ndarray | slice) -> "_Sides":
+        return _Sides(*(values[own] for values in vars(self).values()))
 
 
-def _place(channel: np.ndarray, corners: np.ndarray, config: LineFittingConfig, least: float = 0.0) -> _Sides | str:
-    """Lays the profiles across the sides of a coarse quadrilateral; or why it cannot.
+def _place(
+    sheet: Sheet, corners: np.ndarray, config: LineFittingConfig, least: float = 0.0
+) -> tuple[_Sides, list[str]]:
+    """Lays the profiles across the sides of coarse quadrilaterals (Q, 4, 2); and why it cannot, or "", for each.
 
     least: half a profile's length that blur calls for, if the opposite side is far enough [px].
     """
-    ends = corners[NEXT]
+    ends = corners[:, NEXT]
     along = ends - corners
-    lengths = np.sqrt((along * along).sum(1))
-    if lengths.min() < 4:
-        return "small"
-    flat = np.abs(along[:, 0]) >= np.abs(along[:, 1])
-    t_axis = np.where(flat, 0, 1)
-    slope = along[_FOUR, 1 - t_axis] / along[_FOUR, t_axis]
+    lengths = np.sqrt((along * along).sum(2))
+    flat = np.abs(along[:, :, 0]) >= np.abs(along[:, :, 1])
+
+    def by_side(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Along and across each side."""
+        u, v = points[:, :, 0], points[:, :, 1]
+        return np.where(flat, u, v), np.where(flat, v, u)
+
+    (begin_t, begin_y), (end_t, end_y), (middle_t, middle_y) = map(by_side, (corners, ends, corners.mean(1)[:, None]))
+    slope = (end_y - begin_y) / np.where(lengths > 0, end_t - begin_t, 1)
     cosine = 1 / np.sqrt(1 + slope**2)
     # A profile must reach neither the opposite side nor the rim of the light plate round the marker.
-    width = polygon_area(corners) / lengths.max()
-    half = int(max(min(max(round(config.reach * width), 3), config.half_window), min(least, 0.3 * width)))
+    one, other = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    width = np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]) / 2 / np.maximum(lengths.max(1), 1e-9)
+    half = np.minimum(np.maximum(np.rint(config.reach * width), 3), config.half_window)
+    half = np.maximum(half, np.minimum(least, 0.3 * width)).astype(int)
     reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 3.0)) + _LEAST_HALF * np.abs(slope) * cosine
-    begin = np.minimum(corners[_FOUR, t_axis], ends[_FOUR, t_axis]) + reach * cosine
-    stop = np.maximum(corners[_FOUR, t_axis], ends[_FOUR, t_axis]) - reach * cosine
-    limit = np.where(flat, channel.shape[1], channel.shape[0]) - 1
-    first = np.maximum(np.ceil(begin), 0).astype(int)
-    count = np.minimum(np.floor(stop), limit).astype(int) - first + 1
-    if count.min() < 3:
-        return f"side {int(np.argmin(count))} short"
-    start = corners[_FOUR, 1 - t_axis] - slope * corners[_FOUR, t_axis]
-    inward = np.sign(corners.mean(0)[1 - t_axis] - (corners + ends)[_FOUR, 1 - t_axis] / 2)
-    return _Sides(channel, flat, first, count, start, slope, inward, half)
+    reach *= cosine
+    (low_t, _), (high_t, _) = by_side(sheet.low[:, None]), by_side(sheet.high[:, None])
+    first = np.maximum(np.ceil(np.minimum(begin_t, end_t) + reach), low_t).astype(int)
+    count = np.minimum(np.floor(np.maximum(begin_t, end_t) - reach), high_t).astype(int) - first + 1
+    reasons = []
+    for shortest, counts in zip(lengths.min(1), count):
+        short = f"side {int(np.argmin(counts))} short" if counts.min() < 3 else ""
+        reasons.append("small" if shortest < 4 else short)
+    start = begin_y - slope * begin_t
+    inward = np.sign(middle_y - (begin_y + end_y) / 2)
+    return _Sides(flat, first, count, start, slope, inward, half), reasons
 
 
-def _fit_sides(quads: list[_Sides], config: LineFittingConfig) -> list[RawQuad]:
+def _fit_sides(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> list[RawQuad]:
     """Step 3: the sides of all quadrilaterals together, as arrays (S sides, N profiles, M pixels)."""
+    Q = len(sides.half)
     flat, first, count, start, slope, inward = (
-        np.concatenate([getattr(q, name) for q in quads])
-        for name in ("flat", "first", "count", "start", "slope", "inward")
+        getattr(sides, name).ravel() for name in ("flat", "first", "count", "start", "slope", "inward")
     )
-    half = np.repeat([float(q.half) for q in quads], 4)
-    images = Images.of([q.channel for q in quads])
-    origin, wide, tall = (np.repeat(a, 4) for a in (images.origin, images.wide, images.tall))
-    # Pixel (t, y) of a side is pixels[origin + by_t t + by_y y].
-    by_t, by_y = np.where(flat, 1, wide)[:, None], np.where(flat, wide, 1)[:, None, None]
-    by_y = by_y.astype(np.int32)
-    last_t, last_y = np.where(flat, wide, tall)[:, None] - 1, np.where(flat, tall, wide)[:, None, None] - 1
-    last_y = last_y.astype(np.int32)
+    half = np.repeat(sides.half, 4)[:, None]
+
+    def by_quad(values: np.ndarray) -> np.ndarray:
+        return values.reshape(Q, -1).sum(1)
+
+    wide = sheet.pixels.shape[1]
+    pixels = sheet.pixels.ravel()
+    by_t, by_y = np.where(flat, 1, wide)[:, None], np.where(flat, wide, 1)[:, None]  # pixel (t, y) is t by_t + y by_y
+    low, high = (
+        np.repeat(ends, 4, axis=0)[np.arange(4 * Q), flat.astype(int), None] for ends in (sheet.low, sheet.high)
+    )
     cosine = 1 / np.sqrt(1 + slope**2)
     reach = int(half.max()) + 1
-    across = np.arange(-reach, reach + 1, dtype=np.int32)
-    across_32 = across.astype(np.float32)
+    across = np.arange(-reach, reach + 1)[:, None]
+    across_32, across_at = across.astype(np.float32), by_y[:, None] * across
+    # Of all profiles (S, N): where they are along the image and along the side, how long, and the first straight line.
+    k = np.arange(count.max())
+    t = first[:, None] + k
+    from_end = np.minimum(k, count[:, None] - 1 - k)
+    all_used = (from_end >= 0).astype(float)
+    all_tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1
+    rooms = all_used * (half + 1 - np.maximum(half - _LEAST_HALF - from_end / _LEAN, 0))
+    lines = start[:, None] + slope[:, None] * t
+    all_powers = basis(all_tau)
 
-    def profiles(k: np.ndarray) -> tuple:
-        """Those with numbers k on each side, about what is known of it so far: all that the fit needs of them."""
-        t = first[:, None] + k  # (S, N)
-        used = k < count[:, None]
-        tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1 along each side
-        from_end = np.minimum(k, count[:, None] - 1 - k)
-        room = half[:, None] - np.maximum(half[:, None] - _LEAST_HALF - from_end / _LEAN, 0)
-        room = (room + 1).astype(np.float32)[:, :, None]  # (S, N, 1)
-        line = start[:, None] + slope[:, None] * t
-        powers = basis(tau)
-        middle = np.rint(line + (powers @ coefficient[:, :, None])[:, :, 0])
-        y = middle.astype(np.int32)[:, :, None] + across  # (S, N, M)
-        inside = np.minimum(np.maximum(y, 0), last_y)
-        valid = (inside == y).astype(np.float32)
-        valid *= used[:, :, None]
-        inside *= by_y
-        inside += (origin[:, None] + by_t * np.minimum(t, last_t)).astype(np.int32)[:, :, None]
-        f = images.pixels.take(inside)  # float32, as all that is per pixel
-        return t, used.astype(float), tau, room, line, middle, f, valid, powers
+    def profiles(stride: int) -> tuple:
+        """Every stride-th one of each side, about what is known of it so far: all that the fit needs of them."""
+        some = np.s_[:, ::stride]
+        line, powers = lines[some], all_powers[:, :, ::stride]
+        middle = np.rint(line + (coefficient[:, None] @ powers)[:, 0])
+        at = t[some] * by_t + middle.astype(int) * by_y
+        functions = np.empty((len(count), 5, len(across), at.shape[1]), np.float32)  # see `gram`
+        functions[:, 0] = 1
+        functions[:, 4] = pixels.take(at[:, None] + across_at, mode="clip")
+        return all_used[some], all_tau[some], rooms[some], line, middle, functions, powers
 
     # On long sides the way there is found with some of the profiles, and the last step is made with all of them.
     stride = max(int(count.min()) // _ENOUGH, 1)
     coefficient = np.zeros((len(count), 3))  # of the sides' deviation from their first straight lines
-    t, used, tau, room, line, middle, f, valid, powers = profiles(np.arange(0, count.max(), stride))
+    used, tau, room, line, middle, functions, powers = profiles(stride)
     bend = np.where(count >= 24, 1e-9, 1e9)  # short sides show no curvature of the lens
     good, blur, last = used, np.full(len(count), _SHARP), False
     has_step = np.full(len(count), True)
     for iteration in range(config.iterations):
         if last and stride > 1:
-            k = np.arange(count.max())
-            t, used, tau, room, line, middle, f, valid, powers = profiles(k)
+            used, tau, room, line, middle, functions, powers = profiles(1)
             good = used * good[:, k // stride]
-        curve = line + (powers @ coefficient[:, :, None])[:, :, 0]
-        offset = (middle - curve).astype(np.float32)[:, :, None] + across_32
-        weight = room - np.abs(offset)  # no pixel enters or leaves at once
+        curve = line + (coefficient[:, None] @ powers)[:, 0]
+        z = (middle - curve).astype(np.float32)[:, None] + across_32
+        # Nothing counts beyond the cut-out's border; and no pixel enters or leaves at once.
+        room = np.minimum(room, np.minimum(curve - low, high - curve) + 1)
+        weight = room.astype(np.float32)[:, None] - np.abs(z)
         _within(weight, 0, 1, out=weight)
-        weight *= valid
-        width = blur  # that this step is linear about
-        z = offset
         z *= (inward * cosine / blur).astype(np.float32)[:, None, None]
-        bell = z * z
-        bell *= np.float32(-0.5)
-        np.exp(bell, out=bell)
-        bell *= np.float32(1 / np.sqrt(2 * np.pi))
-        rise = normal_cdf(z, bell)
-        level, normal = _levels(weight, good, rise, bell, f, tau)
+        _, rise, bell, z_bell, _ = functions.swapaxes(0, 1)
+        normal_density(z, out=bell)
+        normal_cdf(z, bell, out=rise)
+        np.multiply(z, bell, out=z_bell)
+        products = gram(weight, functions)
+        level, normal = _levels(moments(products, good, tau, _LEVEL_TERMS))
         has_step &= level[:, 2] >= 0.3
-        base = (level[:, 0:1] + level[:, 1:2] * tau).astype(np.float32)
-        height = np.maximum(level[:, 2:3] + level[:, 3:4] * tau, 0.05)  # (S, N)
-        gain = bell
-        gain *= (height / blur[:, None]).astype(np.float32)[:, :, None]
-        residual = f - base[:, :, None]
-        residual -= height.astype(np.float32)[:, :, None] * rise
-        pull = weight * gain
-        strength = _dot(pull, gain) + 1e-12
-        shift = -_dot(pull, residual) / strength  # of each profile's edge, along the inward normal
-        left = gain * shift.astype(np.float32)[:, :, None]
-        left += residual
-        square = _dot(weight * left, left) / np.maximum(weight @ np.ones(len(across), np.float32), 1)
-        pull *= z  # weight times -d model / d blur
-        pull *= good.astype(np.float32)[:, :, None]
-        by_blur = pull.reshape(len(quads), 1, -1)
-        wrong, scale = ((by_blur @ a.reshape(len(quads), -1, 1)).ravel().astype(float) for a in (left, gain * z))
-        change = np.repeat(wrong / np.maximum(scale, 1e-12), 4)
+        base, height = level[:, 0:1] + level[:, 1:2] * tau, level[:, 2:3] + level[:, 3:4] * tau
+        height = np.maximum(height, 0.05)
+        # What is left of the grey values, by each function; that by the bell is what a shift of the edge would take.
+        left = products[:, ROW[4]] - base[:, None] * products[:, ROW[0]] - height[:, None] * products[:, ROW[1]]
+        gain = height / blur[:, None]
+        strength = gain * gain * products[:, ROW[2][2]] + 1e-12
+        shift = -gain * left[:, 2] / strength  # of each profile's edge, along the inward normal
+        square = left[:, 4] - base * left[:, 0] - height * left[:, 1] - strength * shift * shift
+        square /= np.maximum(products[:, ROW[0][0]], 1)
+        width = blur  # that this step is linear about
+        by_z = good * gain  # -d model / d blur is this times z bell
+        wrong = by_z * (left[:, 3] + gain * shift * products[:, ROW[2][3]])
+        scale = by_z * gain * products[:, ROW[3][3]]
+        change = np.repeat(by_quad(wrong) / np.maximum(by_quad(scale), 1e-12), 4)
         blur = _within(blur - _within(change, -0.5, 0.5), 0.35, 3.0)
-        typical = _median(square, used)
-        good = used * (square < 6 * typical[:, None] + 4e-4) * (strength > 0.2 * strength.max(1, keepdims=True))
+        typical = _median(square, used)[:, None]
+        good = used * (square < 6 * typical + 4e-4) * (strength > 0.2 * strength.max(1, keepdims=True))
         moved = (inward / cosine)[:, None] * _within(shift, -1.5, 1.5)
+        predicted = typical / strength  # variance of a shift
         rounds = 2 if last else 1  # outliers are looked for once the model is near
-        step, good = _smooth(powers, moved, good, bend, np.sqrt(typical[:, None] / strength), rounds)
-        smooth = (powers @ step[:, :, None])[:, :, 0]
+        step, smooth, good = _smooth(powers, moved, good, bend, np.sqrt(predicted), rounds)
         if last:
             break
         coefficient = coefficient + step
         # The next step is about a tenth of this one, and what it leaves a thousandth: the model is odd about the edge.
-        settled = np.abs(used * smooth).max() < 0.5 and np.abs(change).max() < 0.25
+        settled = np.abs(used * smooth).max() < 0.8 and np.abs(change).max() < 0.25
         last = settled or iteration == config.iterations - 2
-    edge = curve + moved
+    curves = Curves(flat, inward, first, count, start, slope, coefficient, cosine)
+    seen = sums(products, good, tau, level, width) if config.together else None
+    off = (moved - smooth) * cosine[:, None]
+    deviation = good * off * off
+    keep = good > 0
+    on_side = keep.sum(1)
     kept = _kept(normal)
-    curves = Curves(flat, inward, first, count, start, slope, coefficient)
-    seen = sums(weight, good, rise, gain, z, residual, tau) if config.together else None
-    points = np.where(flat[:, None, None], np.stack([t, edge], -1), np.stack([edge, t], -1))
-    deviation = good * ((moved - smooth) * cosine[:, None]) ** 2
-    predicted = good * typical[:, None] / strength
-    out, scatter = [], []
-    for q in range(len(quads)):
-        own = slice(4 * q, 4 * q + 4)
-        keep = good[own] > 0
-        share = keep.sum(1) / count[own]
-        n = int(keep.sum())
-        freedom = n - 8 - int((bend[own] < 1).sum())
-        sigma = np.sqrt(
-            (deviation[own].sum() + PRIOR_POINTS * predicted[own].sum() / max(n, 1)) / (freedom + PRIOR_POINTS)
-        )
-        sigma *= np.sqrt(np.mean(1 / kept[own]))
+    n = by_quad(on_side)
+    freedom = n - 8 - by_quad(bend < 1)
+    variance = by_quad(deviation) + PRIOR_POINTS * by_quad(good * predicted) / np.maximum(n, 1)
+    sigma = np.sqrt(variance / (freedom + PRIOR_POINTS) * by_quad(1 / kept) / 4)
+    scatter = np.stack([by_quad(deviation * strength), freedom], 1)
+    edge = curve + moved
+    points = np.stack([np.where(flat[:, None], t, edge), np.where(flat[:, None], edge, t)], -1)[keep]
+    side = np.repeat(np.arange(4 * Q), on_side) % 4
+    out = []
+    for q, (stop, share, step_seen) in enumerate(
+        zip(np.cumsum(n), (on_side / count).reshape(Q, 4), has_step.reshape(Q, 4))
+    ):
+        own = slice(stop - n[q], stop)
         reason = ""
-        if not has_step[own].all():
-            reason = f"side {int(np.argmin(has_step[own]))} has no step"
-        elif share.min() < config.min_share or keep.sum(1).min() < 3:
+        if not step_seen.all():
+            reason = f"side {int(np.argmin(step_seen))} has no step"
+        elif share.min() < config.min_share or on_side[4 * q : 4 * q + 4].min() < 3:
             reason = f"side {int(np.argmin(share))}: {share.min():.2f} of it fits"
-        elif not sigma <= config.max_sigma:
-            reason = f"sides not straight: {sigma:.2f} px"
-        if reason:
-            out.append(RawQuad(reason=reason))
-            continue
-        side = np.repeat(_FOUR, keep.sum(1))
-        scatter.append((float((deviation * strength)[own].sum()), float(freedom)))
-        out.append(RawQuad(points=points[own][keep], side=side, sigma=float(sigma), blur=float(blur[4 * q])))
-    if seen is not None and scatter:
-        fitted = np.array([not raw.reason for raw in out])
-        own = np.repeat(fitted, 4)
-        shared = joint_fit(
-            images[fitted], curves[own], level[own], width[::4][fitted], seen[own], bend[own], np.array(scatter)
+        elif not sigma[q] <= config.max_sigma:
+            reason = f"sides not straight: {sigma[q]:.2f} px"
+        out.append(
+            RawQuad(reason=reason)
+            if reason
+            else RawQuad(points=points[own], side=side[own], sigma=float(sigma[q]), blur=float(blur[4 * q]))
         )
+    fitted = np.array([not raw.reason for raw in out])
+    if seen is not None and fitted.any():
+        one, own = _where(fitted), _where(np.repeat(fitted, 4))
+        shared = joint_fit(sheet[one], curves[own], level[own], width[::4][one], seen[own], bend[own], scatter[one])
         for q, both in zip(np.flatnonzero(fitted), shared):
             if both is not None:
                 out[q] = dc.replace(out[q], together=both[0], information=both[1])
     return out
+
+
+def _where(those: np.ndarray) -> np.ndarray | slice:
+    """An index of those that are True; it copies nothing if all are."""
+    return slice(None) if those.all() else those
 
 
 def _within(x: np.ndarray, low: float, high: float, out: np.ndarray | None = None) -> np.ndarray:
@@ -522,30 +551,15 @@ def _within(x: np.ndarray, low: float, high: float, out: np.ndarray | None = Non
     return np.minimum(np.maximum(x, low, out=out), high, out=out)
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Sum over the pixels of each profile: (S, N, M), (S, N, M) -> (S, N)."""
-    return np.einsum("snm,snm->sn", a, b)
-
-
-def _levels(
-    weight: np.ndarray, good: np.ndarray, rise: np.ndarray, bell: np.ndarray, f: np.ndarray, tau: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _levels(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least squares of f = (b0 + b1 tau) + (a0 + a1 tau) rise + (c0 + c1 tau) bell -> (S, 4): b0, b1, a0, a1.
 
-    The bell's share is what a shift and a turn of the side would change. Without it the levels would take part of
-    a wrong start for themselves, and the fit would creep. And the normal matrix (S, 6, 6) of all six.
+    products (S, 7, 7): of the functions and f by each other. The bell's share is what a shift and a turn of the side
+    would change. Without it the levels would take part of a wrong start for themselves, and the fit would creep.
+    And the normal matrix (S, 6, 6) of all six.
     """
-    S, N, M = weight.shape
-    functions = np.empty((S, 7, N, M), np.float32)  # each times the weight's root
-    root = functions[:, 0]
-    np.sqrt(weight * good.astype(np.float32)[:, :, None], out=root)
-    for k, values in ((2, rise), (4, bell), (6, f)):
-        np.multiply(values, root, out=functions[:, k])
-    np.multiply(functions[:, :6:2], tau.astype(np.float32)[:, None, :, None], out=functions[:, 1:6:2])
-    functions = functions.reshape(S, 7, -1)
-    products = functions[:, :6] @ functions.transpose(0, 2, 1)
-    normal = products[:, :, :6] + _LEVEL_PRIOR
-    return np.linalg.solve(normal, products[:, :, 6:].astype(float))[:, :4, 0], normal
+    normal = products[:, :6, :6] + _LEVEL_PRIOR
+    return np.linalg.solve(normal, products[:, :6, 6:])[:, :4, 0], normal
 
 
 def _kept(normal: np.ndarray) -> np.ndarray:
@@ -555,29 +569,33 @@ def _kept(normal: np.ndarray) -> np.ndarray:
     """
     levels, bells = normal[:, :4, :4], normal[:, :4, 4:]
     taken = (bells * np.linalg.solve(levels, bells)).sum(1)
-    return np.clip(1 - (taken / normal[:, [4, 5], [4, 5]]).mean(1), 0.1, 1.0)
+    whole = normal[:, 4:, 4:].diagonal(axis1=1, axis2=2)
+    return _within(1 - (taken / whole).sum(1) / 2, 0.1, 1.0)
 
 
 def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Upper median of the used entries in each row: (S, N), (S, N) -> (S,)."""
+    S, N = values.shape
     known = used > 0
     ordered = np.where(known, values, np.inf)
     ordered.sort(axis=1)
-    return ordered[np.arange(len(ordered)), np.minimum(known.sum(1) // 2, ordered.shape[1] - 1)]
+    return ordered.take(np.arange(0, S * N, N) + np.minimum(known.sum(1) // 2, N - 1))
 
 
 def _smooth(
     basis: np.ndarray, moved: np.ndarray, good: np.ndarray, bend: np.ndarray, noise: np.ndarray, rounds: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Robust curve through the profiles' shifts (S, N): its coefficients, and which profiles belong to it."""
-    prior = np.zeros((len(bend), 3, 3))
-    prior[:, 0, 0] = prior[:, 1, 1] = 1e-9
-    prior[:, 2, 2] = bend
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Robust curve through the profiles' shifts (S, N): its coefficients, its values, and which profiles belong to it.
+
+    basis (S, 3, N).
+    """
+    prior = _CURVE_PRIOR + bend[:, None, None] * _BEND
+    both = np.concatenate([basis, moved[:, None]], 1).transpose(0, 2, 1)
     for _ in range(rounds):
-        weighted = (basis * good[:, :, None]).transpose(0, 2, 1)
-        c = np.linalg.solve(weighted @ basis + prior, weighted @ moved[:, :, None])
-        value = (basis @ c)[:, :, 0]
+        products = (basis * good[:, None]) @ both
+        c = np.linalg.solve(products[:, :, :3] + prior, products[:, :, 3:])
+        value = (c.transpose(0, 2, 1) @ basis)[:, 0]
         off = np.abs(moved - value)
         spread = 1.48 * _median(off, good)[:, None]
         good = good * (off < 4 * np.maximum(noise, spread) + 0.02)
-    return c[:, :, 0], good
+    return c[:, :, 0], value, good

@@ -36,7 +36,7 @@ from valve_drake.perception.stereo_positioning import turn_between
 METHODS = ("refined", "paper")
 _HOPELESS = 1000.0  # chi^2 above the best from which no further start is refined
 _SHORT_SIDE = 40.0  # blur and surroundings bias shorter sides more [px]
-_FOUR = np.arange(4)
+_FOUR, _EYE, _NODES = np.arange(4), np.eye(8), np.array(NODES)[:, None]
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 _SKEW = np.zeros((3, 9))  # v @ _SKEW is [v]x row by row
 _SKEW[0, [7, 5]], _SKEW[1, [2, 6]], _SKEW[2, [3, 1]] = (1, -1), (1, -1), (1, -1)
@@ -123,6 +123,7 @@ class _Moments:
     R_CL: np.ndarray  # (views, 3, 3)
     p_CL: np.ndarray  # (views, 3)
     right: np.ndarray  # (views,) 1.0 for the right camera, which a relative yaw moves
+    yaw_prior: float  # what is known of that yaw [1/rad^2]; 0 = it is no unknown
     B: np.ndarray  # (views, 12, 12) of the four sides' l [sigma]
     floor: float  # chi^2 of the points about their own sides' best lines
 
@@ -135,6 +136,7 @@ class _Fit:
     cost: float  # chi^2
     information: np.ndarray  # (6 or 7, 6 or 7): theta, p, yaw
     prior: np.ndarray  # (6 or 7,) of these, the diagonal of its own information
+    at: tuple[np.ndarray, np.ndarray] | None = None  # what `_linearize` gave there
 
 
 def estimate(
@@ -162,10 +164,11 @@ def estimate(
             return _refuse(edges, config, reason)
         inflation = 1.0
     else:
-        if not all(view.information.any() for view in views):
+        told = all(view.information.any() for view in views)
+        if not told:
             weights = [_weights(view, _point_residuals(view, best, model), config) for view in views]
             moments = _moments(views, weights, config)
-        best = _refine(moments, model, best.R, best.p, best.yaw, config)
+        best = _refine(moments, model, best.R, best.p, best.yaw, config, at=best.at if told else None)
         if best is None:
             return _refuse(edges, config, "no pose explains the sides")
         covariance = _covariance(moments, model, best)
@@ -230,14 +233,15 @@ def _view(
         return "a side has fewer than two points"
     sigma = max(quad.sigma, config.min_sigma)
     if quad.information.any():
-        corners, trust = quad.corners, np.ones(len(side))
-        lines = _joining(corners)
+        corners, trust, lines = quad.corners, np.ones(len(side)), None
     else:
         lines, trust = _robust_lines(quad.points, side, sigma / lens.focal(), config)
         if lines is None:
             return "sides do not make a quadrilateral"
         corners = meet(lines)
     d = corners[NEXT] - corners
+    if lines is None:
+        lines = _joining(corners, d)
     turning = d[:, 0] * d[NEXT, 1] - d[:, 1] * d[NEXT, 0]
     if not (np.isfinite(corners).all() and (turning > 0).all()):
         return "sides do not make a convex quadrilateral in clockwise order"
@@ -261,12 +265,13 @@ def _view(
     )
 
 
-def _joining(corners: np.ndarray) -> np.ndarray:
-    """The lines (4, 3) of the sides between corners (4, 2), positive inside; unit normals."""
-    q = np.ones((4, 3))
-    q[:, :2] = corners
-    lines = _cross(q, q[NEXT])
-    return lines / np.hypot(lines[:, 0], lines[:, 1])[:, None]
+def _joining(corners: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """The lines (4, 3) of the sides from corners (4, 2) in directions (4, 2), positive inside; unit normals."""
+    lines = np.empty((4, 3))
+    lines[:, 0], lines[:, 1] = -along[:, 1], along[:, 0]
+    lines[:, :2] /= np.sqrt((along * along).sum(1))[:, None]
+    lines[:, 2] = -(lines[:, :2] * corners).sum(1)
+    return lines
 
 
 def _robust_lines(
@@ -329,17 +334,20 @@ def _aligned(left: _View, right: _View) -> _View:
 def _moments(views: list[_View], weights: list[np.ndarray], config: RectangleEstimatorConfig) -> _Moments:
     B = np.zeros((len(views), 12, 12))
     floor = 0.0
-    for view, weight, rows in zip(views, weights, B):
-        # A side is not better known than its common bias, however many points it has.
-        along = view.corners[NEXT] - view.corners
-        bias = config.side_bias * np.clip((_SHORT_SIDE / (view.focal * np.linalg.norm(along, axis=1))) ** 3, 1, 10)
+    corners = np.array([view.corners for view in views])
+    along = corners[:, NEXT] - corners
+    lengths = np.sqrt((along * along).sum(2)) * np.array([[view.focal] for view in views])
+    # A side is not better known than its common bias, however many points it has.
+    biases = config.side_bias * np.minimum(np.maximum((_SHORT_SIDE / lengths) ** 3, 1), 10)
+    for k, (view, weight, bias, rows) in enumerate(zip(views, weights, biases, B)):
         if view.information.any():
             # Two nodes make a side: each has twice the variance of the bias.
-            covariance = np.linalg.inv(view.information) + np.diag(np.repeat(2 * bias**2, 2))
-            nodes = view.corners[:, None] + np.multiply.outer(along, NODES).transpose(0, 2, 1)  # (4, 2, 2)
+            own = np.linalg.solve(_EYE + view.information * np.repeat(2 * bias * bias, 2), view.information)
             distance = np.zeros((4, 2, 4, 3))  # of the nodes from the sides, by l
-            distance[_FOUR, :, _FOUR] = np.concatenate([nodes, np.ones((4, 2, 1))], -1) * view.scale[:, None, None]
-            rows[:8] = np.linalg.cholesky(np.linalg.inv(covariance)).T @ distance.reshape(8, 12)
+            at_node = np.ones((4, 2, 3))
+            at_node[:, :, :2] = corners[k, :, None] + along[k, :, None] * _NODES
+            distance[_FOUR, :, _FOUR] = at_node * view.scale[:, None, None]
+            rows[:8] = np.linalg.cholesky(own).T @ distance.reshape(8, 12)
             continue
         information = np.bincount(view.side, weight, 4) / view.sigma**2
         share = 1 / (1 + information * bias**2)
@@ -355,13 +363,10 @@ def _moments(views: list[_View], weights: list[np.ndarray], config: RectangleEst
         half, gap = (S[:, 0, 0] + S[:, 1, 1]) / 2, np.hypot((S[:, 0, 0] - S[:, 1, 1]) / 2, S[:, 0, 1])
         floor += float(np.maximum(half - gap, 0).sum())
         rows.reshape(4, 3, 4, 3)[_FOUR, :, _FOUR] = out
-    return _Moments(
-        R_CL=np.stack([view.X_CL[:, :3] for view in views]),
-        p_CL=np.stack([view.X_CL[:, 3] for view in views]),
-        right=np.array([float(view.right) for view in views]),
-        B=B,
-        floor=floor,
-    )
+    X_CL = np.array([view.X_CL for view in views])
+    right = np.array([float(view.right) for view in views])
+    yaw_prior = 1 / config.yaw_sigma**2 if config.yaw_sigma > 0 and right.any() else 0.0
+    return _Moments(R_CL=X_CL[:, :, :3], p_CL=X_CL[:, :, 3], right=right, yaw_prior=yaw_prior, B=B, floor=floor)
 
 
 def _point_residuals(view: _View, fit: _Fit, model: np.ndarray) -> np.ndarray:
@@ -402,7 +407,8 @@ def _model_sides(model: bytes) -> tuple[np.ndarray, np.ndarray]:
 def _linearize(
     moments: _Moments, model: np.ndarray, R: np.ndarray, p: np.ndarray, yaw: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Residuals (12 views,) in sigmas and Jacobian by theta (R exp([theta]x)), p and yaw; None if behind a camera."""
+    """Residuals (12 views,) in sigmas and Jacobian by theta (R exp([theta]x)), p and, if unknown, yaw; None if behind
+    a camera."""
     R_CL, p_CL = moments.R_CL, moments.p_CL
     if yaw:
         back = np.stack([frames.rot_y(-yaw * right) for right in moments.right])
@@ -413,20 +419,24 @@ def _linearize(
         return None
     count = len(A)
     e, both = _model_sides(model.tobytes())
-    of_both = np.concatenate([A, (t @ _SKEW).reshape(count, 3, 3) @ A], -1)
-    turned = of_both[:, None] @ both  # (C, 4, 3, 4)
-    dh = np.zeros((count, 4, 3, 8))  # by theta, p, yaw; the last column is h itself
-    dh[..., :3], dh[..., 7] = turned[..., :3], turned[..., 3]
+    of_both = np.empty((count, 1, 3, 6))
+    of_both[:, 0, :, :3] = A
+    np.matmul((t @ _SKEW).reshape(count, 3, 3), A, out=of_both[:, 0, :, 3:])
+    turned = of_both @ both  # (C, 4, 3, 4)
+    n = 7 if moments.yaw_prior else 6
+    dh = np.empty((count, 4, 3, n + 1))  # by theta, p, yaw; the last column is h itself
+    dh[..., :3], dh[..., n] = turned[..., :3], turned[..., 3]
     dh[..., 3:6] = (e @ A.transpose(0, 2, 1) @ -_SKEW).reshape(count, 4, 3, 3) @ R_CL[:, None]
-    dh[:, :, 0, 6] = -dh[:, :, 2, 7] * moments.right[:, None]  # -e_y x h
-    dh[:, :, 2, 6] = dh[:, :, 0, 7] * moments.right[:, None]
-    xy = dh[..., :2, 7]
+    if n == 7:
+        x, y, z = dh[..., 7].transpose(2, 0, 1) * moments.right[:, None]
+        dh[:, :, 0, 6], dh[:, :, 1, 6], dh[:, :, 2, 6] = -z, 0, x  # -e_y x h
+    xy = dh[..., :2, n]
     dh /= np.sqrt((xy * xy).sum(-1))[..., None, None]
-    line = dh[..., 7].copy()
+    line = dh[..., n].copy()
     dh -= line[..., None] * (line[..., None, :2] @ dh[..., :2, :])
-    dh[..., 7] = line
-    out = (moments.B @ dh.reshape(count, 12, 8)).reshape(-1, 8)
-    return out[:, 7], out[:, :7]
+    dh[..., n] = line
+    out = (moments.B @ dh.reshape(count, 12, n + 1)).reshape(-1, n + 1)
+    return out[:, n], out[:, :n]
 
 
 def _refine(
@@ -437,33 +447,33 @@ def _refine(
     yaw: float,
     config: RectangleEstimatorConfig,
     enough: float = 1e-6,
+    at: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> _Fit | None:
-    """Levenberg-Marquardt from (R, p), until a step is expected to lower chi^2 by less than `enough`."""
-    n = 7 if config.yaw_sigma > 0 and moments.right.any() else 6
-    prior = np.zeros(n)
-    if n == 7:
-        prior[6] = 1 / config.yaw_sigma**2
-    at = _linearize(moments, model, R, p, yaw)
+    """Levenberg-Marquardt from (R, p), until a step is expected to lower chi^2 by less than `enough`.
+
+    at: what `_linearize` gives there, if known already.
+    """
+    at = at or _linearize(moments, model, R, p, yaw)
     if at is None:
         return None
+    known = moments.yaw_prior
+    prior = np.array([0.0] * 6 + [known] * bool(known))
     damping = 1e-4
-    cost = at[0] @ at[0] + (prior[6] * yaw**2 if n == 7 else 0.0)
+    cost = at[0] @ at[0] + known * yaw**2
     for _ in range(config.max_iterations):
-        r, J = at[0], at[1][:, :n]
+        r, J = at
         H, g = J.T @ J, J.T @ r
-        if n == 7:
-            H[6, 6] += prior[6]
-            g[6] += prior[6] * yaw
+        if known:
+            H[6, 6] += known
+            g[6] += known * yaw
         damped = H.copy()
-        damped.flat[:: n + 1] += damping * (H.diagonal() + 1e-12)
-        step = np.linalg.solve(damped, -g)
+        damped.flat[:: len(H) + 1] += damping * (H.diagonal() + 1e-12)
+        step = cv2.solve(damped, -g, flags=cv2.DECOMP_CHOLESKY)[1][:, 0]  # a fifth of the time of numpy's
         gain = -2 * (g @ step) - step @ H @ step  # the decrease that the linear model expects
         R_new, p_new = R @ frames.rotation(step[:3]), p + step[3:6]
-        yaw_new = yaw + step[6] if n == 7 else yaw
+        yaw_new = yaw + step[6] if known else yaw
         trial = _linearize(moments, model, R_new, p_new, yaw_new)
-        cost_new = math.inf
-        if trial is not None:
-            cost_new = trial[0] @ trial[0] + (prior[6] * yaw_new**2 if n == 7 else 0.0)
+        cost_new = math.inf if trial is None else trial[0] @ trial[0] + known * yaw_new**2
         if cost_new <= cost:
             R, p, yaw, at, cost = R_new, p_new, yaw_new, trial, cost_new
             damping = max(damping / 10, 1e-9)
@@ -471,9 +481,8 @@ def _refine(
             damping = max(damping * 10, 1e-5)
         if gain < enough or damping > 1e8:
             break
-    J = at[1][:, :n]
-    information = J.T @ J + np.diag(prior)
-    return _Fit(R=R, p=p, yaw=float(yaw), cost=float(cost), information=information, prior=prior)
+    information = at[1].T @ at[1] + np.diag(prior)
+    return _Fit(R=R, p=p, yaw=float(yaw), cost=float(cost), information=information, prior=prior, at=at)
 
 
 def _covariance(moments: _Moments, model: np.ndarray, fit: _Fit) -> np.ndarray:
@@ -496,8 +505,7 @@ def _covariance(moments: _Moments, model: np.ndarray, fit: _Fit) -> np.ndarray:
     at = _linearize(moments, model, fit.R @ frames.rotation(step[:3]), fit.p + step[3:6], yaw)
     if at is None:
         return C[:6, :6]
-    J = at[1][:, : len(C)]
-    return np.linalg.inv(J.T @ J + np.diag(fit.prior))[:6, :6]
+    return np.linalg.inv(at[1].T @ at[1] + np.diag(fit.prior))[:6, :6]
 
 
 def _candidates(
@@ -512,20 +520,19 @@ def _candidates(
     )
     for rvec, tvec in zip(rvecs, tvecs) if ok else ():
         starts.append(_to_left(view, cv2.Rodrigues(rvec)[0], tvec.ravel()))
-    fits = _distinct(moments, model, starts, config)
+    fits, hopeless = _distinct(moments, model, starts, config, [])
     if not fits:
         closed = closed_form([v.corners for v in views], [v.X_CL for v in views], model, "exact")
-        fits = _distinct(moments, model, [closed] if closed is not None else [], config)
-    if len(fits) == 1:
+        fits, hopeless = _distinct(moments, model, [closed] if closed is not None else [], config, [])
+    if len(fits) == 1 and not hopeless:
         mirrored = _mirrored(fits[0].R, fits[0].p)
-        left = _moved_to_fit(moments, model, *mirrored)
-        if not math.isfinite(left):
-            return fits
-        # The mirrored tilt itself, moved to fit, stands for a minimum that it may not have.
-        stand_in = dc.replace(fits[0], R=mirrored[0], cost=max(left, fits[0].cost))
-        fits = _distinct(moments, model, [mirrored], config, known=fits)
-        if len(fits) == 1:
-            fits.append(stand_in)
+        fits, hopeless = _distinct(moments, model, [mirrored], config, fits)
+        if len(fits) == 1 and not hopeless:
+            hopeless = [(_moved_to_fit(moments, model, *mirrored), mirrored[0])]
+    if len(fits) == 1 and math.isfinite(hopeless[0][0]):
+        # The other tilt itself, moved to fit, stands for a minimum that it may not have.
+        cost, R = hopeless[0]
+        fits.append(dc.replace(fits[0], R=R, cost=max(cost, fits[0].cost)))
     return fits
 
 
@@ -534,20 +541,24 @@ def _distinct(
     model: np.ndarray,
     starts: list[tuple[np.ndarray, np.ndarray]],
     config: RectangleEstimatorConfig,
-    known: list[_Fit] | None = None,
-) -> list[_Fit]:
-    """`known` and the fits from `starts` that end elsewhere, best first."""
-    fits = list(known or [])
+    known: list[_Fit],
+) -> tuple[list[_Fit], list[tuple[float, np.ndarray]]]:
+    """`known` and the fits from `starts` that end elsewhere, best first; and chi^2 and R of those that were so much
+    worse than a known one that they were left."""
+    fits, hopeless = list(known), []
     for R, p in starts:
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
             continue
-        if fits and _moved_to_fit(moments, model, R, p) > fits[0].cost + _HOPELESS:
-            continue
+        if fits:
+            cost = _moved_to_fit(moments, model, R, p)
+            if cost > fits[0].cost + _HOPELESS:
+                hopeless.append((cost, R))
+                continue
         fit = _refine(moments, model, R, p, 0.0, config, enough=0.05)
         if fit is not None and fit.R[2, 2] > 0:
             if not any(np.linalg.norm(frames.rotation_vector(fit.R.T @ other.R)) < 1e-3 for other in fits):
                 fits.append(fit)
-    return sorted(fits, key=lambda fit: fit.cost)
+    return sorted(fits, key=lambda fit: fit.cost), hopeless
 
 
 def _moved_to_fit(moments: _Moments, model: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
@@ -557,7 +568,7 @@ def _moved_to_fit(moments: _Moments, model: np.ndarray, R: np.ndarray, p: np.nda
         return math.inf
     J, r = at[1][:, 3:6], at[0]
     g = J.T @ r
-    return float(r @ r - g @ np.linalg.solve(J.T @ J, g))
+    return float(r @ r - g @ cv2.solve(J.T @ J, g, flags=cv2.DECOMP_CHOLESKY)[1][:, 0])
 
 
 def _to_left(view: _View, R: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -609,15 +620,15 @@ def _settle_axis(
 def _mark_votes(views: list[_View], fit: _Fit, marker: Marker) -> tuple[int, int]:
     """Green marks found where they should be if X is the fit's x axis, or its y axis."""
     r, depth = marker.handle_radius, marker.mark_depth
-    places = np.array([[r, 0, depth], [-r, 0, depth], [0, r, depth], [0, -r, depth]])
+    places = np.array([[r, 0, depth], [-r, 0, depth], [0, r, depth], [0, -r, depth], [0, 0, 0]])
     votes = np.zeros(4, int)
     for view in views:
-        P = (np.vstack([places, np.zeros(3)]) @ fit.R.T + fit.p) @ view.X_CL[:, :3].T + view.X_CL[:, 3]
+        P = (places @ fit.R.T + fit.p) @ view.X_CL[:, :3].T + view.X_CL[:, 3]
         if len(view.green) == 0 or not (P[:, 2] > 1e-3).all():
             continue
         xy = P[:, :2] / P[:, 2:]
-        off = np.linalg.norm(view.green[None] - xy[:4, None], axis=2).min(1)
-        votes += off < 0.2 * np.linalg.norm(xy[:4] - xy[4], axis=1)
+        off, far = view.green[None] - xy[:4, None], xy[:4] - xy[4]
+        votes += (off * off).sum(2).min(1) < 0.04 * (far * far).sum(1)
     return int(votes[0] + votes[1]), int(votes[2] + votes[3])
 
 
@@ -635,7 +646,8 @@ def _quarter_turned(
 def _half_turned(fit: _Fit) -> _Fit:
     sign = np.ones(len(fit.information))
     sign[:2] = -1  # theta is in V
-    return dc.replace(fit, R=fit.R @ _HALF_TURN, information=fit.information * np.outer(sign, sign))
+    r, J = fit.at
+    return dc.replace(fit, R=fit.R @ _HALF_TURN, information=fit.information * np.outer(sign, sign), at=(r, J * sign))
 
 
 # ---------------------------------------------------------------- the paper's closed form

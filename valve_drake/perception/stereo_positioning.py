@@ -15,11 +15,12 @@ from valve_drake import frames
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require_in
 from valve_drake.messages import MarkerCandidate, SegmentationPair, StereoPosition
-from valve_drake.perception.color_segmentation import middle
+from valve_drake.perception.color_segmentation import middle, polygon_area
 from valve_drake.perception.marker import NEXT, Marker
 
 _CORNER = np.arange(4)
-_TURNED = (_CORNER[:, None] + _CORNER) % 4
+_TURNED = (_CORNER[:, None] + _CORNER) % 4  # corners counted from the k-th one
+_PINHOLE, _NO_DISTORTION = np.eye(3), np.zeros(4)
 
 
 @dc.dataclass
@@ -68,10 +69,10 @@ def match(
     config: StereoPositioningConfig,
 ) -> Match:
     """The pair of accepted candidates that fits the marker best."""
-    seen = []
+    seen, rectangles = [], _rectangles(marker)
     for candidates, lens in ((left, head.left), (right, head.right)):
         accepted = [k for k, c in enumerate(candidates) if not c.rejected]
-        seen.append([(k, _by_size(candidates[k], lens, marker)) for k in accepted])
+        seen.append([(k, _by_size(candidates[k], lens, rectangles)) for k in accepted])
     for side, one in zip(("left", "right"), seen):
         if not one:
             return Match(reason=f"no candidate in the {side} image")
@@ -107,9 +108,10 @@ def single(
 ) -> int:
     """Index of the accepted candidate that one camera alone takes for the marker, or -1: the best of those whose
     corners fit the rectangle at a plausible distance."""
+    rectangles = _rectangles(marker)
     for k, candidate in enumerate(candidates):
         if not candidate.rejected:
-            for depth, misfit in _by_size(candidate, lens, marker):
+            for depth, misfit in _by_size(candidate, lens, rectangles):
                 if misfit < _shape_gate(candidate, config) and config.min_distance < depth < config.max_distance:
                     return k
     return -1
@@ -154,7 +156,7 @@ def wrong_size(
     corners' errors in depth do not lengthen them) must have the marker's lengths. One camera cannot tell a long box
     from the marker seen at a slant, two can.
     """
-    P, _ = _mid_points(left, np.roll(right, -turn_between(left, right), axis=0), head)
+    P, _ = _mid_points(left, right[_TURNED[turn_between(left, right)]], head)
     sides = P[NEXT] - P
     lengths = np.linalg.norm(sides[:2] - sides[2:], axis=1) / 2
     baseline = max(float(np.linalg.norm(head.X_LR[:, 3])), 1e-9)
@@ -184,38 +186,43 @@ def _mid_points(left: np.ndarray, right: np.ndarray, head: StereoHead) -> tuple[
     b = b @ head.X_LR[:, :3].T
     aa, ab, bb, ta, tb = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1), a @ t, b @ t
     det = aa * bb - ab * ab
-    det = np.where(det < 1e-12 * aa * bb, np.nan, det)
+    det[det < 1e-12 * aa * bb] = np.nan
     on_a = ((bb * ta - ab * tb) / det)[:, None] * a
     on_b = ((ab * ta - aa * tb) / det)[:, None] * b + t
-    return (on_a + on_b) / 2, np.linalg.norm(on_a - on_b, axis=1)
+    gap = on_a - on_b
+    return (on_a + on_b) / 2, np.sqrt((gap * gap).sum(1))
 
 
-def _by_size(candidate: MarkerCandidate, lens: LensModel, marker: Marker) -> list[tuple[float, float]]:
-    """Depth of a candidate by the marker's known size, and the misfit of its corners as a share of its size; for a
-    marker that is no square once for either choice of its long sides.
+def _rectangles(marker: Marker) -> list[np.ndarray]:
+    """The marker's corners (4, 3), for one that is no square once for either choice of its long sides.
 
     A few pixels do not tell a rectangle from one with its sides exchanged and tilted: that choice is not made here.
     """
+    corners = marker.corners()
+    return [corners, corners[_TURNED[3]]] if marker.aspect() > 1.03 else [corners]
+
+
+def _by_size(candidate: MarkerCandidate, lens: LensModel, rectangles: list[np.ndarray]) -> list[tuple[float, float]]:
+    """Depth of a candidate by the marker's known size, and the misfit of its corners as a share of its size; for each
+    of `_rectangles`."""
     corners = lens.normalize(candidate.corners)
     size = math.sqrt(max(candidate.area, 1.0)) / lens.focal()
     fits = []
-    for turn in (0, 1) if marker.aspect() > 1.03 else (0,):
+    for rectangle in rectangles:
         # Corners of a mask lie half a pixel inside; the area does not.
-        rectangle = np.roll(marker.corners(), turn, axis=0)
-        best = (math.inf, math.inf)
         ok, rvecs, tvecs, _ = cv2.solvePnPGeneric(
-            rectangle, corners[:, None, :], np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
+            rectangle, corners[:, None], _PINHOLE, _NO_DISTORTION, flags=cv2.SOLVEPNP_IPPE
         )
+        best = (math.inf, math.inf)
         for rvec, tvec in zip(rvecs, tvecs) if ok else ():
-            X = rectangle @ cv2.Rodrigues(rvec)[0].T + tvec.ravel()
-            if not (X[:, 2] > 1e-6).all():
+            X = rectangle @ cv2.Rodrigues(rvec)[0].T + tvec[:, 0]
+            if not X[:, 2].min() > 1e-6:
                 continue
             seen = X[:, :2] / X[:, 2:]
-            misfit = float(np.sqrt(((seen - corners) ** 2).sum(1).mean())) / size
+            off = (seen - corners).ravel()
+            misfit = math.sqrt(off @ off / 4) / size
             if misfit < best[1]:
-                p, q = seen, seen[NEXT]
-                area = abs((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()) / 2
-                best = (float(tvec[2, 0]) * math.sqrt(area) / size, misfit)
+                best = (float(tvec[2, 0]) * math.sqrt(polygon_area(seen)) / size, misfit)
         fits.append(best)
     return fits
 
