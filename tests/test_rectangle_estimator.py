@@ -232,6 +232,21 @@ def test_two_nodes_on_each_side_say_what_all_points_say():
         np.testing.assert_allclose(np.diag(nodes.covariance), np.diag(points.covariance), rtol=0.25)
 
 
+def test_refined_ends_in_a_minimum_whichever_tilt_the_track_prefers():
+    """Seen frontally by one eye there may be no second minimum, and the track may prefer the side that has none."""
+    rng, marker = np.random.default_rng(3), MARKER.corners()
+    for _ in range(20):
+        X = facing(1.2, *rng.uniform(-0.02, 0.02, 2), rng.uniform(-0.5, 0.5))
+        edges = edge_points(X, HEAD, MARKER, 0.1, rng, cameras="left")
+        edges = dc.replace(with_information(dc.replace(edges, right=edges.left)), right=edges.right)
+        moments = _moments(_views(edges, HEAD, CONFIG)[0], [], CONFIG)
+        for pan in (-0.3, 0.3):
+            found = estimate(edges, HEAD, MARKER, CONFIG, Track(facing(1.2, pan, 0.0, 0.0)))
+            r, J = _linearize(moments, marker, found.X_LV[:, :3], found.X_LV[:, 3], 0.0)
+            g = J.T @ r
+            assert g @ np.linalg.solve(J.T @ J, g) < 1e-3  # of chi^2, that a step would gain
+
+
 def test_points_are_not_believed_better_than_min_sigma_with_their_information_either():
     edges = with_information(edge_points(POSES[1], HEAD, MARKER, 0.02))
     plain, careful = (

@@ -93,7 +93,7 @@ class Lens:
             slope = 1 + 2 * (self.k_u * of_u / by_u + self.k_v * of_v / by_v)
             step = (of_u + of_v - rr) / slope
             rr = rr + step
-            if np.abs(step).max(initial=0.0) < 1e-6:  # the next one would be its square
+            if np.abs(step).max(initial=0.0) < 1e-3:  # the next one would be its square times k, some 1e-12
                 break
         out = np.empty(np.shape(xy))
         out[..., 0], out[..., 1] = u / (1 + self.k_u * rr) + self.u_0, v / (1 + self.k_v * rr) + self.v_0

@@ -343,9 +343,10 @@ def _judge(image: np.ndarray, region: Region, config: ColorSegmentationConfig) -
     elif corners is None:
         rejected = "corners: not four"
     else:
-        sides = np.linalg.norm(corners[NEXT] - corners, axis=1)
+        along = corners[NEXT] - corners
+        sides = np.sqrt((along * along).sum(1)).tolist()
         # Half a pixel all round: the corners are pixel centres of the outline.
-        quad_area = polygon_area(corners) + sides.sum() / 2 + 1
+        quad_area = polygon_area(corners) + sum(sides) / 2 + 1
         fill = min(region.area / quad_area, quad_area / region.area)
         # Blur rounds the corners of a small region.
         least = config.min_fill - min(1.5 / np.sqrt(region.area), 0.1)

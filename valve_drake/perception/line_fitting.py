@@ -405,35 +405,70 @@ def _place(
     return _Sides(flat, first, count, start, slope, inward, half), reasons
 
 
+@dc.dataclass(frozen=True)
+class _Followed:
+    """Where the sides' edges were found to be, (S,) or (S, N) for every profile."""
+
+    curves: Curves
+    bend: np.ndarray  # prior on each side's bend
+    has_step: np.ndarray  # there was one of enough height at every iteration
+    t: np.ndarray  # of the profiles
+    edge: np.ndarray  # position across of each profile's own edge
+    good: np.ndarray  # 1 where a profile belongs to its side
+    off: np.ndarray  # of its edge from the side's curve, along the normal [px]
+    expected: np.ndarray  # variance of that, by the noise of the grey values [px^2]
+    strength: np.ndarray  # what its pixels know of its edge's place, times the grey values' variance [1/px^2]
+    tau: np.ndarray
+    products: np.ndarray  # (S, 15, N), see `gram`
+    level: np.ndarray  # (S, 4)
+    normal: np.ndarray  # (S, 6, 6), see `_levels`
+    width: np.ndarray  # blur that the last step was linear about [px] ...
+    blur: np.ndarray  # ... and the one found
+
+
 def _fit_sides(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> list[RawQuad]:
-    """Step 3: the sides of all quadrilaterals together, as arrays (S sides, N profiles, M pixels)."""
+    """Steps 3 and 4 for all quadrilaterals together."""
+    found = _follow(sheet, sides, config)
+    out, scatter = _judged(found, config)
+    fitted = np.array([not raw.reason for raw in out])
+    if config.together and fitted.any():
+        seen = sums(found.products, found.good, found.tau, found.level, found.width)
+        one, own = _where(fitted), _where(np.repeat(fitted, 4))
+        width = found.width[::4][one]
+        shared = joint_fit(
+            sheet[one], found.curves[own], found.level[own], width, seen[own], found.bend[own], scatter[one]
+        )
+        for q, both in zip(np.flatnonzero(fitted), shared):
+            if both is not None:
+                out[q] = dc.replace(out[q], together=both[0], information=both[1])
+    return out
+
+
+def _follow(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> _Followed:
+    """Step 3, as arrays (S sides, M pixels, N profiles)."""
     Q = len(sides.half)
     flat, first, count, start, slope, inward = (
         getattr(sides, name).ravel() for name in ("flat", "first", "count", "start", "slope", "inward")
     )
-    half = np.repeat(sides.half, 4)[:, None]
-
-    def by_quad(values: np.ndarray) -> np.ndarray:
-        return values.reshape(Q, -1).sum(1)
-
     wide = sheet.pixels.shape[1]
     pixels = sheet.pixels.ravel()
     by_t, by_y = np.where(flat, 1, wide)[:, None], np.where(flat, wide, 1)[:, None]  # pixel (t, y) is t by_t + y by_y
     low, high = (
         np.repeat(ends, 4, axis=0)[np.arange(4 * Q), flat.astype(int), None] for ends in (sheet.low, sheet.high)
     )
+    half = np.repeat(sides.half, 4)[:, None]
     cosine = 1 / np.sqrt(1 + slope**2)
     reach = int(half.max()) + 1
     across = np.arange(-reach, reach + 1)[:, None]
     across_32, across_at = across.astype(np.float32), by_y[:, None] * across
-    # Of all profiles (S, N): where they are along the image and along the side, how long, and the first straight line.
+    # Of all profiles: where they are along the image and along the side, how long, and the first straight line.
     k = np.arange(count.max())
-    t = first[:, None] + k
+    all_t = first[:, None] + k
     from_end = np.minimum(k, count[:, None] - 1 - k)
     all_used = (from_end >= 0).astype(float)
     all_tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1
     rooms = all_used * (half + 1 - np.maximum(half - _LEAST_HALF - from_end / _LEAN, 0))
-    lines = start[:, None] + slope[:, None] * t
+    lines = start[:, None] + slope[:, None] * all_t
     all_powers = basis(all_tau)
 
     def profiles(stride: int) -> tuple:
@@ -441,11 +476,14 @@ def _fit_sides(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> list[R
         some = np.s_[:, ::stride]
         line, powers = lines[some], all_powers[:, :, ::stride]
         middle = np.rint(line + (coefficient[:, None] @ powers)[:, 0])
-        at = t[some] * by_t + middle.astype(int) * by_y
+        at = all_t[some] * by_t + middle.astype(int) * by_y
         functions = np.empty((len(count), 5, len(across), at.shape[1]), np.float32)  # see `gram`
         functions[:, 0] = 1
         functions[:, 4] = pixels.take(at[:, None] + across_at, mode="clip")
         return all_used[some], all_tau[some], rooms[some], line, middle, functions, powers
+
+    def by_quad(values: np.ndarray) -> np.ndarray:
+        return np.repeat(values.reshape(Q, -1).sum(1), 4)
 
     # On long sides the way there is found with some of the profiles, and the last step is made with all of them.
     stride = max(int(count.min()) // _ENOUGH, 1)
@@ -485,14 +523,14 @@ def _fit_sides(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> list[R
         by_z = good * gain  # -d model / d blur is this times z bell
         wrong = by_z * (left[:, 3] + gain * shift * products[:, ROW[2][3]])
         scale = by_z * gain * products[:, ROW[3][3]]
-        change = np.repeat(by_quad(wrong) / np.maximum(by_quad(scale), 1e-12), 4)
+        change = by_quad(wrong) / np.maximum(by_quad(scale), 1e-12)
         blur = _within(blur - _within(change, -0.5, 0.5), 0.35, 3.0)
         typical = _median(square, used)[:, None]
         good = used * (square < 6 * typical + 4e-4) * (strength > 0.2 * strength.max(1, keepdims=True))
         moved = (inward / cosine)[:, None] * _within(shift, -1.5, 1.5)
-        predicted = typical / strength  # variance of a shift
+        expected = typical / strength
         rounds = 2 if last else 1  # outliers are looked for once the model is near
-        step, smooth, good = _smooth(powers, moved, good, bend, np.sqrt(predicted), rounds)
+        step, smooth, good = _smooth(powers, moved, good, bend, np.sqrt(expected), rounds)
         if last:
             break
         coefficient = coefficient + step
@@ -500,45 +538,62 @@ def _fit_sides(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> list[R
         settled = np.abs(used * smooth).max() < 0.8 and np.abs(change).max() < 0.25
         last = settled or iteration == config.iterations - 2
     curves = Curves(flat, inward, first, count, start, slope, coefficient, cosine)
-    seen = sums(products, good, tau, level, width) if config.together else None
     off = (moved - smooth) * cosine[:, None]
-    deviation = good * off * off
-    keep = good > 0
+    return _Followed(
+        curves=curves,
+        bend=bend,
+        has_step=has_step,
+        t=all_t,
+        edge=curve + moved,
+        good=good,
+        off=off,
+        expected=expected,
+        strength=strength,
+        tau=tau,
+        products=products,
+        level=level,
+        normal=normal,
+        width=width,
+        blur=blur,
+    )
+
+
+def _judged(found: _Followed, config: LineFittingConfig) -> tuple[list[RawQuad], np.ndarray]:
+    """Each quadrilateral's edge points, or why it is none; and the points' scatter (Q, 2), see `joint_fit`."""
+    Q = len(found.blur) // 4
+
+    def by_quad(values: np.ndarray) -> np.ndarray:
+        return values.reshape(Q, -1).sum(1)
+
+    keep = found.good > 0
     on_side = keep.sum(1)
-    kept = _kept(normal)
     n = by_quad(on_side)
-    freedom = n - 8 - by_quad(bend < 1)
-    variance = by_quad(deviation) + PRIOR_POINTS * by_quad(good * predicted) / np.maximum(n, 1)
-    sigma = np.sqrt(variance / (freedom + PRIOR_POINTS) * by_quad(1 / kept) / 4)
-    scatter = np.stack([by_quad(deviation * strength), freedom], 1)
-    edge = curve + moved
-    points = np.stack([np.where(flat[:, None], t, edge), np.where(flat[:, None], edge, t)], -1)[keep]
+    freedom = n - 8 - by_quad(found.bend < 1)
+    deviation = found.good * found.off * found.off
+    variance = by_quad(deviation) + PRIOR_POINTS * by_quad(found.good * found.expected) / np.maximum(n, 1)
+    sigma = np.sqrt(variance / (freedom + PRIOR_POINTS) * by_quad(1 / _kept(found.normal)) / 4)
+    t, y, flat = found.t[keep], found.edge[keep], np.repeat(found.curves.flat, on_side)
+    points = np.stack([np.where(flat, t, y), np.where(flat, y, t)], 1)
     side = np.repeat(np.arange(4 * Q), on_side) % 4
+    share = (on_side / found.curves.count).reshape(Q, 4)
+    fewest, has_step = on_side.reshape(Q, 4).min(1), found.has_step.reshape(Q, 4)
     out = []
-    for q, (stop, share, step_seen) in enumerate(
-        zip(np.cumsum(n), (on_side / count).reshape(Q, 4), has_step.reshape(Q, 4))
-    ):
-        own = slice(stop - n[q], stop)
+    for q, stop in enumerate(np.cumsum(n)):
         reason = ""
-        if not step_seen.all():
-            reason = f"side {int(np.argmin(step_seen))} has no step"
-        elif share.min() < config.min_share or on_side[4 * q : 4 * q + 4].min() < 3:
-            reason = f"side {int(np.argmin(share))}: {share.min():.2f} of it fits"
+        if not has_step[q].all():
+            reason = f"side {int(np.argmin(has_step[q]))} has no step"
+        elif share[q].min() < config.min_share or fewest[q] < 3:
+            reason = f"side {int(np.argmin(share[q]))}: {share[q].min():.2f} of it fits"
         elif not sigma[q] <= config.max_sigma:
             reason = f"sides not straight: {sigma[q]:.2f} px"
-        out.append(
-            RawQuad(reason=reason)
-            if reason
-            else RawQuad(points=points[own], side=side[own], sigma=float(sigma[q]), blur=float(blur[4 * q]))
-        )
-    fitted = np.array([not raw.reason for raw in out])
-    if seen is not None and fitted.any():
-        one, own = _where(fitted), _where(np.repeat(fitted, 4))
-        shared = joint_fit(sheet[one], curves[own], level[own], width[::4][one], seen[own], bend[own], scatter[one])
-        for q, both in zip(np.flatnonzero(fitted), shared):
-            if both is not None:
-                out[q] = dc.replace(out[q], together=both[0], information=both[1])
-    return out
+        if reason:
+            out.append(RawQuad(reason=reason))
+        else:
+            own = slice(stop - n[q], stop)
+            out.append(
+                RawQuad(points=points[own], side=side[own], sigma=float(sigma[q]), blur=float(found.blur[4 * q]))
+            )
+    return out, np.stack([by_quad(deviation * found.strength), freedom], 1)
 
 
 def _where(those: np.ndarray) -> np.ndarray | slice:

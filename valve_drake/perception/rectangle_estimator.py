@@ -136,7 +136,7 @@ class _Fit:
     cost: float  # chi^2
     information: np.ndarray  # (6 or 7, 6 or 7): theta, p, yaw
     prior: np.ndarray  # (6 or 7,) of these, the diagonal of its own information
-    at: tuple[np.ndarray, np.ndarray] | None = None  # what `_linearize` gave there
+    at: tuple[np.ndarray, np.ndarray] | None = None  # what `_linearize` gave there, if that is known
 
 
 def estimate(
@@ -155,7 +155,7 @@ def estimate(
     if track is not None and len(fits) > 1 and fits[1].cost - fits[0].cost < config.ambiguity_gate:
         fits.sort(key=lambda fit: -fit.R[:, 2] @ track.X_LV[:, 2])
     turn, axis_known, fits = _settle_axis(views, moments, fits, marker, config, track)
-    model = np.roll(model, -turn, axis=0)
+    model = model[(_FOUR + turn) % 4]
     best = fits[0]
     ambiguity = fits[1].cost - best.cost if len(fits) > 1 else 0.0
     if config.method == "paper":
@@ -318,7 +318,7 @@ def _aligned(left: _View, right: _View) -> _View:
     turn = turn_between(left.corners, right.corners)
     if turn == 0:
         return right
-    lines, corners, scale = (np.roll(a, -turn, axis=0) for a in (right.lines, right.corners, right.scale))
+    lines, corners, scale = (a[(_FOUR + turn) % 4] for a in (right.lines, right.corners, right.scale))
     nodes = (np.arange(8) + 2 * turn) % 8
     information = right.information[np.ix_(nodes, nodes)]
     return dc.replace(
@@ -339,15 +339,20 @@ def _moments(views: list[_View], weights: list[np.ndarray], config: RectangleEst
     lengths = np.sqrt((along * along).sum(2)) * np.array([[view.focal] for view in views])
     # A side is not better known than its common bias, however many points it has.
     biases = config.side_bias * np.minimum(np.maximum((_SHORT_SIDE / lengths) ** 3, 1), 10)
+    told = [k for k, view in enumerate(views) if view.information.any()]
+    if told:
+        # Two nodes make a side: each has twice the variance of the bias.
+        information = np.array([views[k].information for k in told])
+        common = np.repeat(2 * biases[told] ** 2, 2, axis=1)[:, None]
+        root = np.linalg.cholesky(np.linalg.solve(_EYE + information * common, information))
+        distance = np.zeros((len(told), 4, 2, 4, 3))  # of the nodes from the sides, by l
+        at_node = np.ones((4, len(told), 2, 3))
+        at_node[..., :2] = (corners[told, :, None] + along[told, :, None] * _NODES).swapaxes(0, 1)
+        at_node *= np.array([views[k].scale for k in told]).T[:, :, None, None]
+        distance[:, _FOUR, :, _FOUR] = at_node
+        B[told, :8] = root.swapaxes(1, 2) @ distance.reshape(-1, 8, 12)
     for k, (view, weight, bias, rows) in enumerate(zip(views, weights, biases, B)):
-        if view.information.any():
-            # Two nodes make a side: each has twice the variance of the bias.
-            own = np.linalg.solve(_EYE + view.information * np.repeat(2 * bias * bias, 2), view.information)
-            distance = np.zeros((4, 2, 4, 3))  # of the nodes from the sides, by l
-            at_node = np.ones((4, 2, 3))
-            at_node[:, :, :2] = corners[k, :, None] + along[k, :, None] * _NODES
-            distance[_FOUR, :, _FOUR] = at_node * view.scale[:, None, None]
-            rows[:8] = np.linalg.cholesky(own).T @ distance.reshape(8, 12)
+        if k in told:
             continue
         information = np.bincount(view.side, weight, 4) / view.sigma**2
         share = 1 / (1 + information * bias**2)
@@ -532,7 +537,7 @@ def _candidates(
     if len(fits) == 1 and math.isfinite(hopeless[0][0]):
         # The other tilt itself, moved to fit, stands for a minimum that it may not have.
         cost, R = hopeless[0]
-        fits.append(dc.replace(fits[0], R=R, cost=max(cost, fits[0].cost)))
+        fits.append(dc.replace(fits[0], R=R, cost=max(cost, fits[0].cost), at=None))
     return fits
 
 
@@ -636,7 +641,7 @@ def _quarter_turned(
     moments: _Moments, fits: list[_Fit], marker: Marker, config: RectangleEstimatorConfig
 ) -> list[_Fit]:
     """The fits with the image's first corner one further along the model."""
-    model = np.roll(marker.corners(), -1, axis=0)
+    model = marker.corners()[NEXT]
     # Corner 0 of the image now is the model's corner 1: V turns back by a quarter against the image.
     Q = frames.rot_z(-np.pi / 2)
     turned = [_refine(moments, model, fit.R @ Q, fit.p, fit.yaw, config) for fit in fits[:2]]
@@ -646,8 +651,8 @@ def _quarter_turned(
 def _half_turned(fit: _Fit) -> _Fit:
     sign = np.ones(len(fit.information))
     sign[:2] = -1  # theta is in V
-    r, J = fit.at
-    return dc.replace(fit, R=fit.R @ _HALF_TURN, information=fit.information * np.outer(sign, sign), at=(r, J * sign))
+    at = (fit.at[0], fit.at[1] * sign) if fit.at else None
+    return dc.replace(fit, R=fit.R @ _HALF_TURN, information=fit.information * np.outer(sign, sign), at=at)
 
 
 # ---------------------------------------------------------------- the paper's closed form

@@ -69,17 +69,18 @@ def match(
     config: StereoPositioningConfig,
 ) -> Match:
     """The pair of accepted candidates that fits the marker best."""
-    seen, rectangles = [], _rectangles(marker)
-    for candidates, lens in ((left, head.left), (right, head.right)):
-        accepted = [k for k, c in enumerate(candidates) if not c.rejected]
-        seen.append([(k, _by_size(candidates[k], lens, rectangles)) for k in accepted])
+    rectangles = _rectangles(marker)
+    seen = [
+        [(k, _coarse_fit(c, lens, rectangles)) for k, c in enumerate(candidates) if not c.rejected]
+        for candidates, lens in ((left, head.left), (right, head.right))
+    ]
     for side, one in zip(("left", "right"), seen):
         if not one:
             return Match(reason=f"no candidate in the {side} image")
     best, least, reason = None, math.inf, ""
-    for i, fits_i in seen[0]:
-        for j, fits_j in seen[1]:
-            cost, why = _disagreement(left[i], right[j], fits_i, fits_j, head, config)
+    for i, fit_i in seen[0]:
+        for j, fit_j in seen[1]:
+            cost, why = _disagreement(fit_i, fit_j, head, config)
             if why:
                 reason = reason or f"candidates {i}, {j}: {why}"
             elif cost < least:
@@ -111,8 +112,8 @@ def single(
     rectangles = _rectangles(marker)
     for k, candidate in enumerate(candidates):
         if not candidate.rejected:
-            for depth, misfit in _by_size(candidate, lens, rectangles):
-                if misfit < _shape_gate(candidate, config) and config.min_distance < depth < config.max_distance:
+            for depth, misfit in _coarse_fit(candidate, lens, rectangles).by_size:
+                if misfit < _shape_gate(candidate.area, config) and config.min_distance < depth < config.max_distance:
                     return k
     return -1
 
@@ -202,52 +203,46 @@ def _rectangles(marker: Marker) -> list[np.ndarray]:
     return [corners, corners[_TURNED[3]]] if marker.aspect() > 1.03 else [corners]
 
 
-def _by_size(candidate: MarkerCandidate, lens: LensModel, rectangles: list[np.ndarray]) -> list[tuple[float, float]]:
-    """Depth of a candidate by the marker's known size, and the misfit of its corners as a share of its size; for each
-    of `_rectangles`."""
+@dc.dataclass(frozen=True)
+class _CoarseFit:
+    """What the coarse corners of a candidate alone tell."""
+
+    center: np.ndarray  # (2,) where the diagonals meet, ideal: the area's centre is not the image of one point
+    area: float  # [px^2]
+    by_size: list[tuple[float, float]]  # for each of `_rectangles`: depth [m], misfit as a share of its size
+
+
+def _coarse_fit(candidate: MarkerCandidate, lens: LensModel, rectangles: list[np.ndarray]) -> _CoarseFit:
     corners = lens.normalize(candidate.corners)
     size = math.sqrt(max(candidate.area, 1.0)) / lens.focal()
+    # Corners of a mask lie half a pixel inside; the area does not.
+    larger = size / math.sqrt(polygon_area(corners))
     fits = []
     for rectangle in rectangles:
-        # Corners of a mask lie half a pixel inside; the area does not.
-        ok, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+        ok, _, tvecs, errors = cv2.solvePnPGeneric(
             rectangle, corners[:, None], _PINHOLE, _NO_DISTORTION, flags=cv2.SOLVEPNP_IPPE
         )
-        best = (math.inf, math.inf)
-        for rvec, tvec in zip(rvecs, tvecs) if ok else ():
-            X = rectangle @ cv2.Rodrigues(rvec)[0].T + tvec[:, 0]
-            if not X[:, 2].min() > 1e-6:
-                continue
-            seen = X[:, :2] / X[:, 2:]
-            off = (seen - corners).ravel()
-            misfit = math.sqrt(off @ off / 4) / size
-            if misfit < best[1]:
-                best = (float(tvec[2, 0]) * math.sqrt(polygon_area(seen)) / size, misfit)
-        fits.append(best)
-    return fits
+        if ok and tvecs[0][2, 0] > 0:  # the best comes first; its error is the rms of all coordinates
+            fits.append((float(tvecs[0][2, 0]) / larger, math.sqrt(2) * float(errors[0, 0]) / size))
+        else:
+            fits.append((math.inf, math.inf))
+    return _CoarseFit(center=middle(corners), area=candidate.area, by_size=fits)
 
 
-def _shape_gate(candidate: MarkerCandidate, config: StereoPositioningConfig) -> float:
-    return config.shape_gate + config.corner_sigma / math.sqrt(max(candidate.area, 1.0))
+def _shape_gate(area: float, config: StereoPositioningConfig) -> float:
+    return config.shape_gate + config.corner_sigma / math.sqrt(max(area, 1.0))
 
 
 def _disagreement(
-    left: MarkerCandidate,
-    right: MarkerCandidate,
-    fits_left: list[tuple[float, float]],
-    fits_right: list[tuple[float, float]],
-    head: StereoHead,
-    config: StereoPositioningConfig,
+    left: _CoarseFit, right: _CoarseFit, head: StereoHead, config: StereoPositioningConfig
 ) -> tuple[float, str]:
     """How badly a pair fits one marker (small is good), or why it cannot be one."""
-    gate = min(_shape_gate(left, config), _shape_gate(right, config))
-    misfits = [max(a[1], b[1]) for a, b in zip(fits_left, fits_right)]
+    small = min(left.area, right.area)
+    gate = _shape_gate(max(left.area, right.area), config)
+    misfits = [max(a[1], b[1]) for a, b in zip(left.by_size, right.by_size)]
     if min(misfits) > gate:
         return 0.0, f"shape: corners off by {min(misfits):.2f} of its size"
-    # Not the areas' centres: near and tilted, they are not images of one point.
-    P, gap = _mid_points(
-        head.left.normalize(middle(left.corners)[None]), head.right.normalize(middle(right.corners)[None]), head
-    )
+    P, gap = _mid_points(left.center[None], right.center[None], head)
     p = P[0]
     if not p[2] > 0:
         return 0.0, "rays do not meet"
@@ -257,13 +252,12 @@ def _disagreement(
     if not config.min_distance < p[2] < config.max_distance:
         return 0.0, f"distance: {p[2]:.2f} m"
     # Relative depth error of one pixel, by size and by disparity.
-    small = 1 / math.sqrt(min(left.area, right.area))
     disparity = head.right.focal() * np.linalg.norm(head.X_LR[:, 3]) / p[2]
-    allowed = config.size_gate + config.corner_sigma * (small + 1 / disparity)
+    allowed = config.size_gate + config.corner_sigma * (1 / math.sqrt(small) + 1 / disparity)
     p_R = frames.apply(frames.inverse(head.X_LR), p)
     wrong, misfit = min(
         (max(abs(math.log(a[0] / p[2])), abs(math.log(b[0] / p_R[2]))), m)
-        for a, b, m in zip(fits_left, fits_right, misfits)
+        for a, b, m in zip(left.by_size, right.by_size, misfits)
         if m <= gate
     )
     if wrong > allowed:
