@@ -43,8 +43,8 @@ def test_products_are_sums_over_the_pixels():
         for j in range(5):
             direct = (weight * functions[:, i] * functions[:, j]).astype(float).sum(1)
             np.testing.assert_allclose(products[:, mut.ROW[i][j]], direct, atol=1e-5)
-    terms = np.array([(0, 0), (2, 3), (4, 1)])
-    both = mut.moments(products, good, tau, terms)
+    terms = [(0, 0), (2, 3), (4, 1)]
+    both = mut.moments(products, good, tau, mut.Terms(*terms))
     for a, (i, k) in enumerate(terms):
         for b, (j, m) in enumerate(terms):
             direct = (products[:, mut.ROW[i][j]] * good * tau ** (k + m)).sum(1)

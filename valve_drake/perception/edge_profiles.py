@@ -59,18 +59,26 @@ def gram(weight: np.ndarray, functions: np.ndarray) -> np.ndarray:
     return out.astype(float)
 
 
-def moments(products: np.ndarray, good: np.ndarray, tau: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Products (S, n, n) of n terms, function times power of tau each, over all profiles: of (S, 15, N) by `gram`.
+class Terms:
+    """A list of terms, each one of the five functions times a power of tau."""
 
-    good, tau (S, N): weight and place of the profiles. terms (n, 2): function and power.
+    def __init__(self, *terms: tuple[int, int]):
+        function, power = np.array(terms).T
+        self.row = np.array(ROW)[function[:, None], function]  # of the products of any two of them, (n, n)
+        self.power = power[:, None] + power
+        self.highest = int(self.power.max())
+
+
+def moments(products: np.ndarray, good: np.ndarray, tau: np.ndarray, terms: Terms) -> np.ndarray:
+    """Products (S, n, n) of n terms over all profiles: from (S, 15, N) by `gram`.
+
+    good, tau (S, N): weight and place of the profiles.
     """
-    powers = np.empty((*tau.shape, 2 * terms[:, 1].max() + 1))
+    powers = np.empty((*tau.shape, terms.highest + 1))
     powers[:, :, 0] = good
-    for k in range(1, powers.shape[2]):
-        np.multiply(powers[:, :, k - 1], tau, out=powers[:, :, k])
-    both = products @ powers
-    row = np.array(ROW)[terms[:, None, 0], terms[:, 0]]
-    return both[:, row, terms[:, None, 1] + terms[:, 1]]
+    for k in range(terms.highest):
+        np.multiply(powers[:, :, k], tau, out=powers[:, :, k + 1])
+    return (products @ powers)[:, terms.row, terms.power]
 
 
 def normal_density(z: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:

@@ -17,7 +17,7 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.perception.edge_profiles import Sheet, moments, normal_cdf, normal_density
+from valve_drake.perception.edge_profiles import Sheet, Terms, moments, normal_cdf, normal_density
 from valve_drake.perception.marker import NEXT
 
 _BEFORE = np.array([3, 0, 1, 2])
@@ -30,7 +30,7 @@ _COMMON[:, [0, 2], [0, 3]] = _COMMON[:, 7, 18] = 1
 for _k in range(4):
     _COMMON[_k, [4, 5, 6], [6 + 3 * _k, 7 + 3 * _k, 8 + 3 * _k]] = 1
 # Of the five functions of `gram`, by powers of tau: what the eight unknowns of a side and the residual are made of.
-_TERMS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2), (2, 3), (3, 0), (3, 1), (4, 0)])
+_TERMS = Terms((0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2), (2, 3), (3, 0), (3, 1), (4, 0))
 _LEVELS, _BEND, _BLUR = slice(0, 4), 6, 7
 _LITTLE = 1e-9 * np.eye(7)
 _UNEVEN = 2.5  # chi^2 per degree of freedom by which the sides' levels may contradict common planes
@@ -111,7 +111,7 @@ def sums(products: np.ndarray, good: np.ndarray, tau: np.ndarray, level: np.ndar
     b0, b1, h0, h1 = level.T
     g0, g1 = h0 / blur, h1 / blur
     # The eight functions of a side, and the residual, in terms of _TERMS.
-    F = np.zeros((len(tau), 9, len(_TERMS)))
+    F = np.zeros((len(tau), 9, len(_TERMS.row)))
     F[:, _FOUR, _FOUR] = F[:, 8, 10] = 1
     F[:, 4, 4] = F[:, 5, 5] = F[:, 6, 6] = -g0
     F[:, 4, 5] = F[:, 5, 6] = F[:, 6, 7] = -g1

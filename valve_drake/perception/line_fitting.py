@@ -23,13 +23,13 @@ from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require_in
 from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, SegmentationPair
 from valve_drake.perception.color_segmentation import every
-from valve_drake.perception.edge_profiles import ROW, Sheet, gram, moments, normal_cdf, normal_density
+from valve_drake.perception.edge_profiles import ROW, Sheet, Terms, gram, moments, normal_cdf, normal_density
 from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, basis, joint_fit, meet, sums
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig, match, single, wrong_size
 
 # 1, tau, rise, tau rise, bell, tau bell, and the grey value. A short side shows no trend: it is held near zero there.
-_LEVEL_TERMS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (4, 0)])
+_LEVEL_TERMS = Terms((0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (4, 0))
 _LEVEL_PRIOR = np.diag([1e-9, 0.1, 1e-9, 0.1, 1e-6, 1e-6])
 _CURVE_PRIOR, _BEND = np.diag([1e-9, 1e-9, 0.0]), np.diag([0.0, 0.0, 1.0])
 _FOUR = np.arange(4)
@@ -41,7 +41,7 @@ _ONE_HUE = 0.96  # least cosine between the marker's colour in the shadow and in
 _TWO_LEVELS = 0.25  # share of that variance which two lights leave unexplained at most
 _LEAST_HALF = 2  # half a profile's length at a side's ends, where the light plate is narrowest [px] ...
 _LEAN = 2.5  # ... and the pixels along the side that it needs for one more
-_ENOUGH = 20  # profiles of a side that find the way to its edge
+_ENOUGH = 30  # profiles of a side that find the way to its edge
 _GROWN = np.array([0.75, 1.14, 1.3])  # the marker's inside, and a ring of its surroundings, over its size
 _SHARP = 0.8  # blur that is looked for first: a lens in focus, and the pixel itself [px]
 
@@ -535,7 +535,7 @@ def _follow(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> _Followed
             break
         coefficient = coefficient + step
         # The next step is about a tenth of this one, and what it leaves a thousandth: the model is odd about the edge.
-        settled = np.abs(used * smooth).max() < 0.8 and np.abs(change).max() < 0.25
+        settled = np.abs(used * smooth).max() < 0.5 and np.abs(change).max() < 0.25
         last = settled or iteration == config.iterations - 2
     curves = Curves(flat, inward, first, count, start, slope, coefficient, cosine)
     off = (moved - smooth) * cosine[:, None]
