@@ -204,11 +204,6 @@ def _contrast(share: np.ndarray, config: ColorSegmentationConfig) -> np.ndarray:
     return cv2.blur(cv2.subtract(share, mean), (3, 3))
 
 
-def every(image: np.ndarray, step: int) -> np.ndarray:
-    """Every step-th pixel of every step-th row (1 or 2), but perhaps the last: what slices give, sooner."""
-    return image if step == 1 else cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST)
-
-
 def _outlines(mask: np.ndarray) -> list[np.ndarray]:
     return list(cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0])
 

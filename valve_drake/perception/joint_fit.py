@@ -20,11 +20,10 @@ import numpy as np
 from valve_drake.perception.edge_profiles import Sheet, Terms, moments, normal_cdf, normal_density
 from valve_drake.perception.marker import NEXT
 
-_BEFORE = np.array([3, 0, 1, 2])
+_FOUR, _BEFORE = np.arange(4), np.array([3, 0, 1, 2])
 NODES = (1 - 1 / np.sqrt(3)) / 2, (1 + 1 / np.sqrt(3)) / 2  # of a side's length, from its first corner
 # A side's own unknowns: two levels outside, two of the step, its shift, turn and bend, the blur. Common unknowns:
 # plane outside (3), plane of the step (3), four shifts (3 each), the blur; _COMMON (4, 8, 19) makes a side's of them.
-_FOUR = np.arange(4)
 _COMMON = np.zeros((4, 8, 19))
 _COMMON[:, [0, 2], [0, 3]] = _COMMON[:, 7, 18] = 1
 for _k in range(4):
@@ -108,8 +107,7 @@ class Sums:
 
 def sums(products: np.ndarray, good: np.ndarray, tau: np.ndarray, level: np.ndarray, blur: np.ndarray) -> Sums:
     """products (S, 15, N): see `gram`; good, tau (S, N) of each profile; level (S, 4), blur (S,) it is linear about."""
-    b0, b1, h0, h1 = level.T
-    g0, g1 = h0 / blur, h1 / blur
+    g0, g1 = level[:, 2] / blur, level[:, 3] / blur  # of the step's height, over the blur
     # The eight functions of a side, and the residual, in terms of _TERMS.
     F = np.zeros((len(tau), 9, len(_TERMS.row)))
     F[:, _FOUR, _FOUR] = F[:, 8, 10] = 1

@@ -22,7 +22,6 @@ import numpy as np
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require_in
 from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, SegmentationPair
-from valve_drake.perception.color_segmentation import every
 from valve_drake.perception.edge_profiles import ROW, Sheet, Terms, gram, moments, normal_cdf, normal_density
 from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, basis, joint_fit, meet, sums
 from valve_drake.perception.marker import NEXT, Marker
@@ -227,7 +226,7 @@ def side_lines(points: np.ndarray, side: np.ndarray, sides: int = 4) -> tuple[np
 def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tuple[np.ndarray, float]:
     """One linear channel, float32: about 1 inside, about 0 outside; and the contrast it has [grey levels]."""
     step = 2 if (corners.max(0) - corners.min(0)).max() > _LARGE else 1
-    small, corners = every(part, step), corners / step
+    small, corners = _every(part, step), corners / step
     if config.gamma != 1.0:
         table = (255 * (np.arange(256) / 255) ** config.gamma).astype(np.float32)
         part, small = cv2.LUT(part, table), cv2.LUT(small, table)
@@ -245,6 +244,11 @@ def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tu
         return part[:, :, 0], 0.0
     w = difference / (difference @ (core - ring))
     return cv2.transform(part.astype(np.float32), np.array([[*w, -w @ ring]], np.float32)), contrast
+
+
+def _every(image: np.ndarray, step: int) -> np.ndarray:
+    """Every step-th pixel of every step-th row (1 or 2), but perhaps the last: what slices give, sooner."""
+    return image if step == 1 else cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST)
 
 
 def _even_light(part: np.ndarray, small: np.ndarray, inside: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
@@ -291,7 +295,7 @@ def _even_light(part: np.ndarray, small: np.ndarray, inside: np.ndarray, step: i
     s = np.tanh(((columns - middle[0]) * best[0] + (rows - middle[1]) * best[1]) / size + best[2])
     lit = np.maximum(one, other)
     part = (part / np.clip((levels[0] + levels[1] * s[..., None]) / lit, 0.1, 1)).astype(np.float32)
-    return part, every(part, step)
+    return part, _every(part, step)
 
 
 def _hough_corners(sheet: Sheet, corners: np.ndarray) -> np.ndarray:
@@ -302,7 +306,7 @@ def _hough_corners(sheet: Sheet, corners: np.ndarray) -> np.ndarray:
     Q = len(corners)
     step = 2 if (corners.max(1) - corners.min(1)).max(1).min() > _LARGE else 1
     coarse, corners = corners, corners / step
-    gray = cv2.convertScaleAbs(cv2.max(every(sheet.pixels, step), 0.0), alpha=255)
+    gray = cv2.convertScaleAbs(cv2.max(_every(sheet.pixels, step), 0.0), alpha=255)
     edges = cv2.Canny(gray, 60, 120)
     band = np.zeros(edges.shape, np.uint8)
     cv2.polylines(band, list((corners * 16).round().astype(np.int32)), True, 255, 7, shift=4)
