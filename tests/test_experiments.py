@@ -148,6 +148,7 @@ def test_robustness_finds_the_marker_and_nothing_else():
     rows = {row["condition"]: row for row in result["rows"]}
     assert all(row["found %"] == 100 for row in rows.values())
     assert not any(row["wrong"] for row in rows.values())
+    assert all(0.01 < row["NEES/6"] < 4 for row in rows.values())
     assert result["totals"]["wrong detections in them"] == 0
 
 
