@@ -66,6 +66,17 @@ def test_marker_is_the_best_candidate_at_every_distance_and_light(z, finish):
     assert polygon_area(candidates[0].corners) > 0.7 * 0.7 * side**2
 
 
+@pytest.mark.parametrize("z", [0.5, 0.7, 2.0])  # the near ones are cut out of the half image
+def test_outline_lies_as_far_inside_on_either_side(z):
+    rng, off = np.random.default_rng(4), []
+    for _ in range(12):
+        X = facing(z, *rng.uniform(-0.1, 0.1, 2), rng.uniform(-0.4, 0.4), *rng.uniform(-0.01, 0.01, 2))
+        P = frames.apply(X, Marker().corners())
+        best = segment(valve_image(X, rng), CONFIG)[0][0]
+        off.append(best.corners.mean(0) - LENS.project(P[:, :2] / P[:, 2:]).mean(0))
+    assert np.abs(np.mean(off, 0)).max() < 0.25
+
+
 def test_oblique_marker_is_found_at_65_degrees():
     X = facing(3.0, np.radians(65), 0.0, 0.3)
     candidates, _ = segment(valve_image(X, np.random.default_rng(0)), CONFIG)

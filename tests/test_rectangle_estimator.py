@@ -132,12 +132,14 @@ def test_refined_is_exact_without_noise_whatever_corner_comes_first(cameras, k):
         assert found.residual_px < 1e-6
 
 
-@pytest.mark.parametrize("told", ["points", "information"])
+@pytest.mark.parametrize("told", ["points", "information", "information of one"])
 def test_jacobian_equals_finite_differences(told):
     X = facing(0.9, 0.4, -0.3, 0.5, 0.1, 0.05)
     edges = edge_points(X, HEAD, MARKER, 0.1, np.random.default_rng(0))
     config = dc.replace(CONFIG, yaw_sigma=0.02)
-    views, _ = _views(with_information(edges) if told == "information" else edges, HEAD, config)
+    informed = with_information(edges)
+    edges = {"points": edges, "information": informed}.get(told, dc.replace(informed, left=edges.left))
+    views, _ = _views(edges, HEAD, config)
     moments = _moments(views, [v.trust for v in views], config)
     model, yaw, e = MARKER.corners(), 0.01, 1e-6
     R, p = frames.rotation(np.array([0.02, -0.01, 0.03])) @ X[:, :3], X[:, 3] + 0.003
@@ -245,6 +247,17 @@ def test_refined_ends_in_a_minimum_whichever_tilt_the_track_prefers():
             r, J = _linearize(moments, marker, found.X_LV[:, :3], found.X_LV[:, 3], 0.0)
             g = J.T @ r
             assert g @ np.linalg.solve(J.T @ J, g) < 1e-3  # of chi^2, that a step would gain
+
+
+def test_moments_of_one_view_do_not_depend_on_how_the_other_is_told():
+    edges = edge_points(POSES[0], HEAD, MARKER, 0.1, np.random.default_rng(0))
+    informed = with_information(edges)
+    both, mixed = (
+        _moments(views, [view.trust for view in views], CONFIG).B
+        for views in (_views(e, HEAD, CONFIG)[0] for e in (informed, dc.replace(informed, left=edges.left)))
+    )
+    np.testing.assert_allclose(mixed[1], both[1], rtol=1e-12)
+    assert not np.allclose(mixed[0], both[0])
 
 
 def test_points_are_not_believed_better_than_min_sigma_with_their_information_either():
