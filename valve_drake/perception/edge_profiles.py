@@ -9,6 +9,7 @@ Arrays: S sides, M pixels across, N profiles along. tau goes from -1 at a side's
 
 import dataclasses as dc
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -27,7 +28,7 @@ class Sheet:
     high: np.ndarray  # (Q, 2) ... and its last
 
     @classmethod
-    def of(cls, channels: list[np.ndarray]) -> "Sheet":
+    def of(cls, channels: Sequence[np.ndarray]) -> "Sheet":
         """channels: (H, W) float32 each. Their borders are drawn out, so that none shows an edge there."""
         tall = max(len(channel) for channel in channels)
         framed = [

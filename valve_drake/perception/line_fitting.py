@@ -1,7 +1,8 @@
 """The four sides of a coloured quadrilateral to a few hundredths of a pixel.
 
 1. The image is mixed to ONE linear channel: the direction in RGB that separates inside from outside best. The light on
-   either side of a shadow's edge across the marker is evened first.
+   either side of a shadow's edge across the marker is evened first. From here on the cut-outs of all cameras lie side
+   by side in one sheet, and each step is made once.
 2. Hough lines through its edge pixels give the four coarse lines (section 4 of the paper), and the mean of the pixels
    along each a better one: what is fitted next then needs fewer steps, and ends at the same place from any start.
 3. Every image column (or row, for an upright side) that crosses a side is one short profile of untouched pixels. A
@@ -159,7 +160,7 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: LineF
     Corners go clockwise as seen. All are fitted in one pass, which costs little more than one.
     """
     out = [RawQuad(reason="outside of the image")] * len(images)
-    channels, lows, near, number = [], [], [], []
+    parts = []
     for k, (image, start) in enumerate(zip(images, corners)):
         least, most = start.min(0), start.max(0)
         pad = max(_PAD, int(0.1 * (most - least).max()))  # the ring that `_mix` looks at grows with the marker
@@ -171,10 +172,10 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: LineF
         if contrast < config.min_contrast:
             out[k] = RawQuad(reason=f"contrast: {contrast:.0f}")
             continue
-        for values, value in ((channels, channel), (lows, low), (near, start - low), (number, k)):
-            values.append(value)
-    if not number:
+        parts.append((k, channel, low, start - low))
+    if not parts:
         return out
+    number, channels, lows, near = zip(*parts)
     sheet = Sheet.of(channels)
     coarse = _hough_corners(sheet, np.array(near) + sheet.low[:, None])
     sides, reasons = _place(sheet, coarse, config)
