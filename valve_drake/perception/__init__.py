@@ -37,6 +37,7 @@ def estimate_rectangle(
     Raises ConfigError for an impossible marker or configuration, ValueError for images of another size.
     """
     marker = Marker(size=list(marker_size), handle_radius=max(0.15, max(marker_size)))
+    # What is not given is right; checking it would cost more than a step of the fit.
     given = [config for config in (segmentation, lines, matching) if config is not None]
     segmentation = segmentation or ColorSegmentationConfig()
     lines = lines or LineFittingConfig(single_camera=right is None)

@@ -233,15 +233,14 @@ def _view(
         return "a side has fewer than two points"
     sigma = max(quad.sigma, config.min_sigma)
     if quad.information.any():
-        corners, trust, lines = quad.corners, np.ones(len(side)), None
+        corners, trust = quad.corners, np.ones(len(side))
+        lines = _joining(corners)
     else:
         lines, trust = _robust_lines(quad.points, side, sigma / lens.focal(), config)
         if lines is None:
             return "sides do not make a quadrilateral"
         corners = meet(lines)
     d = corners[NEXT] - corners
-    if lines is None:
-        lines = _joining(corners, d)
     turning = d[:, 0] * d[NEXT, 1] - d[:, 1] * d[NEXT, 0]
     if not (np.isfinite(corners).all() and (turning > 0).all()):
         return "sides do not make a convex quadrilateral in clockwise order"
@@ -265,8 +264,9 @@ def _view(
     )
 
 
-def _joining(corners: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """The lines (4, 3) of the sides from corners (4, 2) in directions (4, 2), positive inside; unit normals."""
+def _joining(corners: np.ndarray) -> np.ndarray:
+    """The lines (4, 3) of the sides between corners (4, 2), positive inside; unit normals."""
+    along = corners[NEXT] - corners
     lines = np.empty((4, 3))
     lines[:, 0], lines[:, 1] = -along[:, 1], along[:, 0]
     lines[:, :2] /= np.sqrt((along * along).sum(1))[:, None]
@@ -548,8 +548,8 @@ def _distinct(
     config: RectangleEstimatorConfig,
     known: list[_Fit],
 ) -> tuple[list[_Fit], list[tuple[float, np.ndarray]]]:
-    """`known` and the fits from `starts` that end elsewhere, best first; and chi^2 and R of those that were so much
-    worse than a known one that they were left."""
+    """`known` and the fits from `starts` that end elsewhere, best first; and chi^2 and R of those before the cameras
+    that were so much worse than a known one that they were left."""
     fits, hopeless = list(known), []
     for R, p in starts:
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
@@ -557,7 +557,8 @@ def _distinct(
         if fits:
             cost = _moved_to_fit(moments, model, R, p)
             if cost > fits[0].cost + _HOPELESS:
-                hopeless.append((cost, R))
+                if math.isfinite(cost):
+                    hopeless.append((cost, R))
                 continue
         fit = _refine(moments, model, R, p, 0.0, config, enough=0.05)
         if fit is not None and fit.R[2, 2] > 0:
