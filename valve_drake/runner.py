@@ -158,7 +158,7 @@ def run(
         link = link or RobotLink(Bus(scenario.hardware))
     if html is not None or meshcat_port is not None:
         meshcat = Meshcat(MeshcatParams(host="localhost", port=meshcat_port))
-        meshcat.SetCameraPose(np.array([-3.0, -2.6, 2.3]), np.array([-0.6, 0.0, 0.9]))
+        meshcat.SetCameraPose(np.array([-5.2, -3.6, 2.7]), np.array([-1.4, 0.1, 0.8]))  # start and valve in view
     profile.clear()
     writer = LogWriter(log)
     with _log_kept(writer), CameraWorkers() as workers:
