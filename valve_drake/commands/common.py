@@ -1,0 +1,109 @@
+"""What several commands share: exit codes, options, the operator's stop, the live line, the table of a run."""
+
+import argparse
+import contextlib
+import math
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from typing import NoReturn, TypeAlias
+
+from valve_drake.checks import ConfigError
+
+OK, FAILED, BAD_INPUT, DAMAGED = 0, 1, 2, 3  # exit codes
+Subcommands: TypeAlias = "argparse._SubParsersAction[Parser]"
+
+
+class Parser(argparse.ArgumentParser):
+    """Bad arguments are bad input like any other: one line, exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(message)
+
+
+def check_rendering() -> None:
+    """Cameras are rendered through EGL; its absence would otherwise be a long trace from deep inside."""
+    import ctypes
+
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        raise ConfigError("libEGL.so.1 is missing: install it (Debian, Ubuntu: apt-get install libegl1)") from None
+
+
+def scenario_overrides(options: argparse.Namespace) -> list[str]:
+    """--set, --seed and --lockstep as overrides; --duration is checked."""
+    overrides = list(options.set)
+    if options.seed is not None:
+        overrides.append(f"seed={options.seed}")
+    if options.lockstep:
+        overrides.append("hardware.lockstep=true")
+    if options.duration is not None and not (math.isfinite(options.duration) and options.duration > 0):
+        raise ConfigError(f"--duration must be a finite number > 0, got {options.duration}")
+    return overrides
+
+
+@contextlib.contextmanager
+def stopper() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C once is the operator's stop (the robot lets go and stands still), twice breaks off."""
+    count = [0]
+
+    def handle(*_: object) -> None:
+        count[0] += 1
+        if count[0] > 1:
+            raise KeyboardInterrupt
+
+    old = signal.signal(signal.SIGINT, handle)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # leaves through the log's context manager
+    try:
+        yield lambda: count[0] > 0
+    finally:
+        signal.signal(signal.SIGINT, old)
+
+
+@contextlib.contextmanager
+def display(wanted: bool) -> Iterator[Callable]:
+    """A line that shows mode, simulated time and real-time factor, on a terminal only."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not wanted or not console.is_terminal:
+        yield lambda progress: None
+        return
+    with console.status("starting") as status:
+        last = [""]
+
+        def show(progress: object) -> None:
+            mode = progress.mode
+            factor = progress.sim_time / max(progress.wall_time, 1e-9)
+            status.update(f"[bold]{mode.mode}[/]  {progress.sim_time:6.2f} s  x{factor:.2f} real time")
+            if mode.mode != last[0]:
+                console.print(f"{mode.since:7.2f} s  [bold]{mode.mode:<15}[/] {mode.reason}", highlight=False)
+                last[0] = mode.mode
+
+        yield show
+
+
+def print_summary(console: object, s: object) -> None:
+    """What happened in a run: a line for each mode, the verdict, angles and forces."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("mode", "start [s]", "time [s]", "why", box=None, header_style="dim")
+    for span in s.spans:
+        retry = f" (retry {span.attempt})" if span.attempt else ""
+        table.add_row(span.mode + retry, f"{span.start:.2f}", f"{span.duration:.2f}", escape(span.reason))
+    console.print(table)
+    color = "green" if s.outcome == "done" else "red"
+    verdict = s.verdict or "-"
+    console.print(f"[bold {color}]{s.outcome or 'unfinished'}[/]  verdict [bold]{verdict}[/]  {escape(s.reason)}")
+    angles = {"commanded": s.command_rad, "camera": s.angle_camera_rad}
+    angles |= {"hands": s.angle_hands_rad, "true": s.angle_true_rad}
+    known = [f"{k} {round(math.degrees(v), 2) + 0.0:.2f} deg" for k, v in angles.items() if v is not None]
+    if known:
+        console.print("turned: " + "  ".join(known))
+    if s.turn_peak_hand_force_N:
+        console.print(
+            f"while turning: peak {s.turn_peak_hand_force_N:.1f} N a hand, mean {s.turn_mean_hand_force_N:.1f} N, "
+            f"stem beyond the couple {s.turn_mean_stem_force_N:.1f} N mean"
+        )

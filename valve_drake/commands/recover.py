@@ -1,0 +1,24 @@
+"""`valve-drake recover`: a whole log from a truncated or damaged one."""
+
+import argparse
+from pathlib import Path
+
+from valve_drake.commands.common import DAMAGED, OK, Subcommands
+
+
+def add(commands: Subcommands) -> None:
+    p = commands.add_parser("recover", help="a whole log from a truncated or damaged one")
+    p.add_argument("log", type=Path)
+    p.add_argument("-o", "--out", type=Path, required=True)
+    p.set_defaults(command=command)
+
+
+def command(options: argparse.Namespace) -> int:
+    from valve_drake.recording.reader import recover
+
+    source = recover(options.log, options.out)
+    count = sum(topic.count for topic in source.topics.values())
+    print(f"{options.out}: {count} messages up to {source.end:.3f} s")
+    for line in source.damage:
+        print(f"  {line}")
+    return DAMAGED if source.damage else OK

@@ -1,0 +1,104 @@
+"""`valve-drake review`: one page of a log, or of two compared; or one topic as a table."""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from valve_drake.checks import ConfigError
+from valve_drake.commands.common import DAMAGED, OK, Subcommands, print_summary
+
+
+def add(commands: Subcommands) -> None:
+    p = commands.add_parser("review", help="one page of a log: what happened, is it whole; or of two, compared")
+    p.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="one log, or two to compare")
+    p.add_argument("--html", type=Path, metavar="FILE", help="the page (default: LOG with .review.html, beside it)")
+    p.add_argument("--json", action="store_true", help="print the same facts as one JSON object; no page unless --html")
+    p.add_argument("--export", choices=("csv", "npz"), help="write --topic as a table instead")
+    p.add_argument("--topic", help="what to export")
+    p.add_argument("--out", type=Path, metavar="FILE", help="of the export (default: beside the log)")
+    p.set_defaults(command=command)
+
+
+def command(options: argparse.Namespace) -> int:
+    from valve_drake.analysis import report
+
+    if len(options.logs) > 2:
+        raise ConfigError(f"review takes one log or two, got {len(options.logs)}")
+    if options.export or options.topic or options.out:
+        return _export(options)
+    found = [report.review(log) for log in options.logs]
+    if len(found) == 1:
+        subject, facts, page, name = found[0], report.facts, report.page, options.logs[0].stem
+    else:
+        subject, facts, page = report.compare(*found), report.comparison_facts, report.comparison_page
+        name = "-".join(log.stem for log in options.logs)
+    html = options.html or (None if options.json else options.logs[0].with_name(f"{name}.review.html"))
+    if html is not None:
+        _keep_apart("--html", html, options.logs)
+        try:
+            html.write_text(page(subject, html.parent.resolve()), encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"{html} cannot be written: {error.strerror}") from None
+    if options.json:
+        print(json.dumps(facts(subject) | {"html": str(html) if html else None}))
+    else:
+        _print_review(found, subject)
+        print(f"page {html}")
+    return OK if all(one.integrity.sound for one in found) else DAMAGED
+
+
+def _keep_apart(option: str, path: Path, logs: Sequence[Path]) -> None:
+    if path.resolve() in [log.resolve() for log in logs]:
+        raise ConfigError(f"{option} must be another file than the log, got {path}")
+
+
+def _print_review(found: list, subject: object) -> None:
+    from rich.console import Console
+
+    from valve_drake.analysis.report import parting_values
+
+    console = Console(highlight=False, soft_wrap=True)
+    for one in found:
+        if len(found) > 1:
+            console.print(f"{one.log.path}:", markup=False)
+        print_summary(console, one.summary)
+        for line in one.integrity.troubles:
+            console.print(f"damaged: {line}", markup=False)
+        for row in one.integrity.late[:10]:
+            missing = sum(gap.missing for gap in row.gaps)
+            console.print(f"gaps: {row.topic} {len(row.gaps)}, {missing} messages missing", markup=False)
+        whole = "whole" if one.integrity.sound else "not whole"
+        console.print(f"the log is {whole}: {one.integrity.messages} messages, {len(one.integrity.topics)} topics")
+    if len(found) == 1:
+        return
+    first = subject.first
+    if first is None:
+        word = "[bold green]identical[/]" if subject.sound else "no difference"
+        console.print(f"{word}: what both hold is equal to the bit")
+        return
+    a, b = parting_values(first)
+    words = f"{first.field}: {a} and {b}" if first.field else f"only in {found[0 if b is None else 1].log.path}"
+    console.print(f"they part at t = {first.time:.6f} s, {first.topic} {words}", markup=False)
+
+
+def _export(options: argparse.Namespace) -> int:
+    from valve_drake.analysis import export
+    from valve_drake.recording.reader import LogReader
+
+    if not (options.export and options.topic):
+        raise ConfigError("an export wants both --export csv|npz and --topic")
+    if len(options.logs) != 1:
+        raise ConfigError(f"an export is of one log, got {len(options.logs)}")
+    log = LogReader(options.logs[0])
+    name = f"{options.logs[0].stem}{options.topic.replace('/', '.')}.{options.export}"
+    out = options.out or options.logs[0].with_name(name)
+    _keep_apart("--out", out, options.logs)
+    count = export.write(log, options.topic, options.export, out)
+    if options.json:
+        print(json.dumps({"topic": options.topic, "messages": count, "out": str(out), "damage": log.damage}))
+    else:
+        print(f"{out}: {count} messages of {options.topic}")
+        for line in log.damage:
+            print(f"  {line}")
+    return DAMAGED if log.damage else OK
