@@ -14,6 +14,7 @@ from valve_drake.commands.common import (
     check_rendering,
     display,
     print_summary,
+    scenario_overrides,
     stopper,
 )
 
