@@ -13,6 +13,7 @@ import yaml
 
 from valve_drake import frames
 from valve_drake.camera import calibration as cal
+from valve_drake.camera import hand_eye
 from valve_drake.camera.board import Board, find_corners, find_images, natural, parse_board
 from valve_drake.camera.calibration_file import load_calibration, save_camera
 from valve_drake.camera.lens import Lens, OpenCvLens, StereoHead, load_head, save_head
@@ -239,8 +240,8 @@ def board_seen(X_BE: np.ndarray, sigma: float = 0.0, rng: np.random.Generator | 
 def test_hand_eye_of_exact_poses_is_exact():
     X_BE = hand_poses()
     X_CT = [frames.compose(frames.inverse(X_EC), frames.inverse(X), X_BT) for X in X_BE]
-    np.testing.assert_allclose(cal.closed_hand_eye(X_BE, X_CT), X_EC, atol=1e-9)
-    result = cal.hand_eye(PAPER, BOARD.points(), [board_seen(X) for X in X_BE], X_BE)
+    np.testing.assert_allclose(hand_eye.closed_hand_eye(X_BE, X_CT), X_EC, atol=1e-9)
+    result = hand_eye.hand_eye(PAPER, BOARD.points(), [board_seen(X) for X in X_BE], X_BE)
     np.testing.assert_allclose(result.X, X_EC, atol=1e-9)
     np.testing.assert_allclose(result.X_target, X_BT, atol=1e-9)
     assert result.position_mm.max() < 1e-6 and result.left_out_deg.max() < 1e-6
@@ -250,7 +251,7 @@ def test_hand_eye_beside_the_robot_gives_the_camera_in_the_base():
     # The board in the hand and the camera on the base: the same relation with base and hand exchanged.
     X_BE = [frames.inverse(X) for X in hand_poses()]
     corners = [board_seen(frames.inverse(X)) for X in X_BE]
-    result = cal.hand_eye(PAPER, BOARD.points(), corners, X_BE, to_hand=True)
+    result = hand_eye.hand_eye(PAPER, BOARD.points(), corners, X_BE, to_hand=True)
     np.testing.assert_allclose(result.X, X_EC, atol=1e-9)
 
 
@@ -262,7 +263,7 @@ def test_hand_eye_errors_are_those_it_states():
             frames.make(X[:, :3] @ frames.rotation(rng.normal(0, 1e-3, 3)), X[:, 3] + rng.normal(0, 3e-4, 3))
             for X in X_BE
         ]
-        result = cal.hand_eye(PAPER, BOARD.points(), [board_seen(X, 0.2, rng) for X in X_BE], noisy)
+        result = hand_eye.hand_eye(PAPER, BOARD.points(), [board_seen(X, 0.2, rng) for X in X_BE], noisy)
         off.append(1e3 * (result.X[:, 3] - X_EC[:, 3]) / result.sigma_mm)
         assert (
             0.1 < np.sqrt((result.position_mm**2).mean()) < 3 and result.left_out_mm.mean() > result.position_mm.mean()
@@ -273,7 +274,7 @@ def test_hand_eye_errors_are_those_it_states():
 def test_a_hand_that_turned_about_one_axis_is_refused():
     X_BE = hand_poses(two_axes=False)
     with pytest.raises(ConfigError, match="one axis only"):
-        cal.hand_eye(PAPER, BOARD.points(), [board_seen(X) for X in X_BE], X_BE)
+        hand_eye.hand_eye(PAPER, BOARD.points(), [board_seen(X) for X in X_BE], X_BE)
 
 
 # ---------------------------------------------------------------- files

@@ -1,4 +1,4 @@
-"""Calibration of one camera, of the stereo head, and of a camera on a hand, from images of a chessboard.
+"""Calibration of one camera and of the stereo head, from images of a chessboard.
 
 Zhang's method: OpenCV gives the start, one bundle adjustment (Levenberg-Marquardt, analytic Jacobian) ends it for both
 lens models, so that both are judged on the same corners:
@@ -9,12 +9,12 @@ lens models, so that both are judged on the same corners:
 The root mean square of the residuals does not tell whether a calibration is good. What does: the standard deviations,
 and `split_half`, the difference of points triangulated by two calibrations from every second view.
 
-Frames: L, R cameras; C one camera; T board; B robot base, E hand. Lengths in m, pixels as in lens.py.
+Frames: L, R cameras; C one camera; T board. Lengths in m, pixels as in lens.py.
 """
 
 import dataclasses as dc
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -22,6 +22,7 @@ import numpy as np
 
 from valve_drake import frames
 from valve_drake.camera.board import Board
+from valve_drake.camera.least_squares import divided, minimize, skew, stepped, transform
 from valve_drake.camera.lens import Lens, LensModel, OpenCvLens, StereoHead
 from valve_drake.checks import ConfigError
 
@@ -171,7 +172,7 @@ class _Problem:
         for view in self.views:
             X_LT = state.poses[view.body]
             P = frames.apply(X_LT, view.points)
-            dP = np.concatenate([-X_LT[:, :3] @ _skew(view.points), np.broadcast_to(np.eye(3), (len(P), 3, 3))], 2)
+            dP = np.concatenate([-X_LT[:, :3] @ skew(view.points), np.broadcast_to(np.eye(3), (len(P), 3, 3))], 2)
             mine = slice(self.shared + 6 * view.body, self.shared + 6 * view.body + 6)
             residuals.append([])
             for c, (lens, px) in enumerate(zip(lenses, view.px)):
@@ -179,12 +180,12 @@ class _Problem:
                 if c == 1:
                     R = state.X_LR[:, :3]
                     Q, dQ = (P - state.X_LR[:, 3]) @ R, R.T @ dP
-                    dX = np.concatenate([_skew(Q), np.broadcast_to(-R.T, (len(Q), 3, 3))], 2)
+                    dX = np.concatenate([skew(Q), np.broadcast_to(-R.T, (len(Q), 3, 3))], 2)
                 if not (Q[:, 2] > 1e-6).all():
                     return math.inf, H, g, residuals
                 xy = Q[:, :2] / Q[:, 2:]
                 seen, D, own = self.kind.project(lens, xy)
-                D = D @ _divided(xy, Q[:, 2])
+                D = D @ divided(xy, Q[:, 2])
                 r = seen - px
                 columns = [np.arange(c * self.m, (c + 1) * self.m), np.arange(mine.start, mine.stop)]
                 blocks = [own, D @ dQ]
@@ -201,9 +202,9 @@ class _Problem:
 
     def moved(self, state: _State, step: np.ndarray) -> _State:
         lenses = tuple(p + step[c * self.m : (c + 1) * self.m] for c, p in enumerate(state.lenses))
-        X_LR = _moved(state.X_LR, step[self.shared - 6 : self.shared]) if self.cameras == 2 else None
+        X_LR = stepped(state.X_LR, step[self.shared - 6 : self.shared]) if self.cameras == 2 else None
         poses = step[self.shared :].reshape(-1, 6)
-        return _State(lenses, X_LR, tuple(_moved(X, s) for X, s in zip(state.poses, poses)))
+        return _State(lenses, X_LR, tuple(stepped(X, s) for X, s in zip(state.poses, poses)))
 
     def names(self) -> tuple[str, ...]:
         if self.cameras == 1:
@@ -212,32 +213,9 @@ class _Problem:
         return (*out, *(f"X_LR.{name}" for name in ("theta_x", "theta_y", "theta_z", "p_x", "p_y", "p_z")))
 
 
-def _minimize(problem: Callable, state: Any, moved: Callable, steps: int = 200) -> tuple[Any, tuple]:
-    """Levenberg-Marquardt from `state` until no step is expected to matter -> the best state, problem(state)."""
-    at = problem(state)
-    if not math.isfinite(at[0]):
-        raise ConfigError("the calibration has no start: do the images, and the poses, belong together?")
-    damping = 1e-4
-    for _ in range(steps):
-        cost, H, g = at[:3]
-        scale = np.sqrt(np.diag(H)) + 1e-150  # a lens's k_u is 1e-7, its k_x 1e3
-        scaled, slope = H / np.outer(scale, scale), g / scale
-        step = -np.linalg.solve(scaled + damping * np.eye(len(g)), slope)
-        gain = -2 * (slope @ step) - step @ scaled @ step
-        trial_state = moved(state, step / scale)
-        trial = problem(trial_state)
-        if trial[0] <= cost:
-            state, at, damping = trial_state, trial, max(damping / 10, 1e-12)
-        else:
-            damping = max(damping * 10, 1e-9)
-        if gain <= 1e-12 * cost + 1e-24 or damping > 1e10:
-            break
-    return state, at
-
-
 def _solve(views: Sequence[View], kind: Any, name: str, start: _State, size: tuple[int, int]) -> Fit:
     problem = _Problem(views, kind, size)
-    state, (cost, H, _, residuals) = _minimize(problem, start, problem.moved)
+    state, (cost, H, _, residuals) = minimize(problem, start, problem.moved)
     corners = sum(len(r) for view in residuals for r in view)
     scale = np.sqrt(np.diag(H)) + 1e-150
     # A direction that the corners do not see shows as a huge deviation instead of an error.
@@ -349,7 +327,7 @@ def _start(
         alone.append((best[1], best[2].ravel(), best[3], best[4]))
         seen.append(px)
     lenses = [(K, dist) for K, dist, _, _ in alone]
-    poses = tuple(_transform(r, t) for r, t in zip(*alone[0][2:]))
+    poses = tuple(transform(r, t) for r, t in zip(*alone[0][2:]))
     if len(alone) == 1:
         return lenses, None, poses
     (K0, d0), (K1, d1) = lenses
@@ -504,188 +482,6 @@ def _pitch(fit: Fit, views: Sequence[View], board: Board) -> tuple[float, float]
         grid = triangulate_all(head, *view.px).reshape(board.rows, board.columns, 3)
         ratios.append(np.linalg.norm(np.diff(grid, axis=1), axis=2).ravel() / board.pitch_x)
     return float(np.mean(ratios)), float(np.std(ratios))
-
-
-# ---------------------------------------------------------------- hand-eye
-
-
-@dc.dataclass(frozen=True)
-class HandEye:
-    """The camera in what carries it: X_EC on a hand (the board stands), X_BC beside the robot (the hand holds it)."""
-
-    X: np.ndarray  # (3, 4) X_EC, or X_BC
-    X_target: np.ndarray  # (3, 4) the board: X_BT, or X_ET
-    sigma_deg: np.ndarray  # (3,) jackknife, about the camera's axes
-    sigma_mm: np.ndarray  # (3,)
-    rotation_deg: np.ndarray  # (n,) residual of each view: the board's pose against X_target
-    position_mm: np.ndarray  # (n,)
-    left_out_deg: np.ndarray  # (n,) the same for a fit without that view
-    left_out_mm: np.ndarray
-    view_rms: np.ndarray  # (n,) of the corners [px]
-    rms: float  # [px]
-
-
-def board_pose(lens: LensModel, points: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """X_CT (3, 4) of a planar board by its corners' least squares."""
-    xy = lens.normalize(px)
-    _, rvec, tvec = cv2.solvePnP(points, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-    rvec, tvec = cv2.solvePnPRefineLM(points, xy, np.eye(3), None, rvec, tvec)
-    return _transform(rvec, tvec)
-
-
-def closed_hand_eye(X_BE: Sequence[np.ndarray], X_CT: Sequence[np.ndarray]) -> np.ndarray:
-    """X_EC (3, 4) from hand poses and board poses (3, 4) each, by Park's method.
-
-    Raises ConfigError unless the hand turned about two axes: about one alone, the camera's place along it is free.
-    """
-    if len(X_BE) < 3:
-        raise ConfigError(f"hand-eye: {len(X_BE)} usable pose(s), needs at least 3")
-    turns = [frames.rotation_vector(a[:, :3].T @ b[:, :3]) for k, a in enumerate(X_BE) for b in X_BE[k + 1 :]]
-    second = float(np.linalg.svd(np.array(turns))[1][1] / math.sqrt(len(turns)))
-    if second < math.radians(2):
-        raise ConfigError(
-            f"hand-eye: the hand turned about one axis only ({math.degrees(second):.1f} deg about any other): "
-            "turn it about two axes, by 30 deg or more"
-        )
-    R, t = cv2.calibrateHandEye(
-        [X[:, :3] for X in X_BE],
-        [X[:, 3] for X in X_BE],
-        [X[:, :3] for X in X_CT],
-        [X[:, 3] for X in X_CT],
-        method=cv2.CALIB_HAND_EYE_PARK,
-    )
-    if not (np.isfinite(R).all() and np.isfinite(t).all()):
-        raise ConfigError("hand-eye: no solution; do the poses belong to the images?")
-    return frames.make(R, t.ravel())
-
-
-def hand_eye(
-    lens: LensModel,
-    points: np.ndarray,
-    corners: Sequence[np.ndarray],
-    X_BE: Sequence[np.ndarray],
-    to_hand: bool = False,
-) -> HandEye:
-    """Hand-eye calibration: Park's method, then least squares of all corners' residuals.
-
-    points (n, 3) in T, corners [(n, 2)] raw px, X_BE (3, 4) for each. to_hand: the camera stands beside the robot and
-    the hand holds the board; the answer is then X_BC.
-    """
-    # Beside the robot, base and hand change places.
-    X_BE = [frames.inverse(X) if to_hand else np.asarray(X, float) for X in X_BE]
-    X_CT = [board_pose(lens, points, px) for px in corners]
-    xy = [lens.normalize(px) for px in corners]
-    X, X_target = _refined_hand_eye(lens, points, xy, X_BE, X_CT)
-    rotation, position = _board_residuals(X, X_target, X_BE, X_CT)
-    everything = range(len(X_BE))
-    turned, moved, left_out = [], [], []
-    for k in everything if len(X_BE) > 3 else ():
-        rest = [i for i in everything if i != k]
-        try:
-            one = _refined_hand_eye(lens, points, *([of[i] for i in rest] for of in (xy, X_BE, X_CT)))
-        except ConfigError:  # the view that alone brought a second axis
-            left_out.append((math.nan, math.nan))
-            continue
-        turned.append(frames.rotation_vector(X[:, :3].T @ one[0][:, :3]))
-        moved.append(one[0][:, 3])
-        left_out.append([float(v[0]) for v in _board_residuals(*one, [X_BE[k]], [X_CT[k]])])
-    n = len(turned)
-    spread = [np.full(3, math.nan)] * 2
-    if n > 1:
-        spread = [np.sqrt((n - 1) / n * ((v - np.mean(v, 0)) ** 2).sum(0)) for v in (np.array(turned), np.array(moved))]
-    square = []
-    for X_i, seen in zip(X_BE, xy):
-        P = frames.apply(frames.compose(frames.inverse(X), frames.inverse(X_i), X_target), points)
-        square.append((((P[:, :2] / P[:, 2:] - seen) * lens.focal()) ** 2).sum(1))
-    out = np.array(left_out or [(math.nan, math.nan)] * len(X_BE))
-    return HandEye(
-        X=X,
-        X_target=X_target,
-        sigma_deg=np.degrees(spread[0]),
-        sigma_mm=1e3 * spread[1],
-        rotation_deg=rotation,
-        position_mm=position,
-        left_out_deg=out[:, 0],
-        left_out_mm=out[:, 1],
-        view_rms=np.array([math.sqrt(s.mean()) for s in square]),
-        rms=math.sqrt(np.mean(square)),
-    )
-
-
-def _board_residuals(
-    X: np.ndarray, X_target: np.ndarray, X_BE: Sequence[np.ndarray], X_CT: Sequence[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """How far each view puts the board from where it is [deg], [mm]."""
-    boards = [frames.compose(X_i, X, X_j) for X_i, X_j in zip(X_BE, X_CT)]
-    turn = [np.degrees(np.linalg.norm(frames.rotation_vector(X_target[:, :3].T @ B[:, :3]))) for B in boards]
-    return np.array(turn), np.array([1e3 * np.linalg.norm(B[:, 3] - X_target[:, 3]) for B in boards])
-
-
-def _refined_hand_eye(
-    lens: LensModel,
-    points: np.ndarray,
-    xy: Sequence[np.ndarray],
-    X_BE: Sequence[np.ndarray],
-    X_CT: Sequence[np.ndarray],
-) -> tuple[np.ndarray, np.ndarray]:
-    """X_EC and X_BT from all corners together, started by the closed form."""
-    X = closed_hand_eye(X_BE, X_CT)
-    boards = [frames.compose(X_i, X, X_j) for X_i, X_j in zip(X_BE, X_CT)]
-    R0 = boards[0][:, :3]
-    turn = np.mean([frames.rotation_vector(R0.T @ B[:, :3]) for B in boards], axis=0)
-    X_BT = frames.make(R0 @ frames.rotation(turn), np.mean([B[:, 3] for B in boards], axis=0))
-    S, focal = _skew(points), lens.focal()
-
-    def problem(state: tuple[np.ndarray, np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
-        X_EC, X_BT = state
-        H, g, cost = np.zeros((12, 12)), np.zeros(12), 0.0
-        for X_i, seen in zip(X_BE, xy):
-            R = (X_i[:, :3] @ X_EC[:, :3]).T  # R_CB
-            P = frames.apply(frames.compose(frames.inverse(X_EC), frames.inverse(X_i), X_BT), points)
-            if not (P[:, 2] > 1e-6).all():
-                return math.inf, H, g
-            at = P[:, :2] / P[:, 2:]
-            D = focal * _divided(at, P[:, 2])
-            dP = np.concatenate(
-                [
-                    _skew(P),
-                    np.broadcast_to(-X_EC[:, :3].T, S.shape),
-                    -R @ X_BT[:, :3] @ S,
-                    np.broadcast_to(R, S.shape),
-                ],
-                2,
-            )
-            J, r = (D @ dP).reshape(-1, 12), focal * (at - seen).ravel()
-            H, g, cost = H + J.T @ J, g + J.T @ r, cost + float(r @ r)
-        return cost, H, g
-
-    def moved(state: tuple[np.ndarray, np.ndarray], step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _moved(state[0], step[:6]), _moved(state[1], step[6:])
-
-    return _minimize(problem, (X, X_BT), moved)[0]
-
-
-# ---------------------------------------------------------------- small helpers
-
-
-def _moved(X: np.ndarray, step: np.ndarray) -> np.ndarray:
-    return frames.make(X[:, :3] @ frames.rotation(step[:3]), X[:, 3] + step[3:])
-
-
-def _skew(v: np.ndarray) -> np.ndarray:
-    """[v]x of (n, 3) -> (n, 3, 3)."""
-    S = np.zeros((len(v), 3, 3))
-    S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return S - S.transpose(0, 2, 1)
-
-
-def _divided(xy: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """d (x / z, y / z) / d (x, y, z) at x / z, y / z = xy (n, 2) -> (n, 2, 3)."""
-    return np.concatenate([np.broadcast_to(np.eye(2), (len(xy), 2, 2)), -xy[:, :, None]], 2) / z[:, None, None]
-
-
-def _transform(rvec: np.ndarray, tvec: np.ndarray) -> np.ndarray:
-    return frames.make(cv2.Rodrigues(rvec)[0], tvec.ravel())
 
 
 def _rms(residuals: np.ndarray) -> float:

@@ -44,12 +44,12 @@ def cameras(numbers: dict[str, Any], result: Calibration, size: tuple[int, int])
     figures = [(f"{fit.rms:.3f} px", "rms of the corners")]
     if both:
         figures.append((f"{numbers['baseline_mm']:.2f} mm", "baseline"))
-    parts = [_head(title, told, numbers["warnings"], figures)]
+    parts = [head(title, told, numbers["warnings"], figures)]
     if both:
         parts.append(_triangulation(numbers))
     lenses = numbers["lenses"].items()
     rows = [(k + " (better)" * (k == result.better), f"{v['rms_px']:.3f}", v["parameters"]) for k, v in lenses]
-    parts += ["<h2>Lens models on the same corners</h2>", _table(("model", "rms [px]", "parameters"), rows)]
+    parts += ["<h2>Lens models on the same corners</h2>", table(("model", "rms [px]", "parameters"), rows)]
     lens = [(name, value) for name, value in numbers["parameters"].items() if not name.startswith("X_LR")]
     rows = [(name, f"{value:.6g}", f"{sigmas[name]:.2g}") for name, value in lens]
     if both:
@@ -59,52 +59,28 @@ def cameras(numbers: dict[str, Any], result: Calibration, size: tuple[int, int])
         for k, axis in enumerate("xyz"):
             position = f"{1e3 * fit.X_LR[k, 3]:.3f}"
             rows.append((f"X_LR position {axis} [mm]", position, f"{spread['position_mm'][k]:.2g}"))
-    parts += ["<h2>Parameters</h2>", _table(("", "value", "standard deviation"), rows)]
+    parts += ["<h2>Parameters</h2>", table(("", "value", "standard deviation"), rows)]
     names, marked = [" / ".join(view.names) for view in result.views], [view["outlier"] for view in views]
-    parts += ["<h2>Views</h2>", _bars(names, [view["rms_px"] for view in views], marked, "px rms")]
+    parts += ["<h2>Views</h2>", bars(names, [view["rms_px"] for view in views], marked, "px rms")]
     rows = [(n, f"{v['rms_px']:.3f}", f"{v['max_px']:.2f}", f"{v['tilt_deg']:.0f}") for n, v in zip(names, views)]
     parts += [
-        _table(("view", "rms [px]", "largest [px]", "tilt [deg]"), rows, marked),
+        table(("view", "rms [px]", "largest [px]", "tilt [deg]"), rows, marked),
         "<h2>Coverage and residuals</h2>",
     ]
     for c, side in enumerate(("left camera", "right camera") if both else ("camera",)):
         caption = f"{side}: corners in {100 * numbers['coverage'][c]:.0f} % of the cells; "
         caption += f"residuals enlarged {_ENLARGED} times"
         px, residuals = [view.px[c] for view in result.views], [view[c] for view in fit.residuals]
-        parts.append(_map(px, residuals, size, caption))
-    return _page(title, parts)
+        parts.append(corner_map(px, residuals, size, caption))
+    return page(title, parts)
 
 
-def hand_eye(numbers: dict[str, Any], corners: Sequence[np.ndarray], size: tuple[int, int]) -> str:
-    """The page of a hand-eye calibration; corners (n, 2) of each view."""
-    key, views = "X_BC" if numbers["eye_to_hand"] else "X_EC", numbers["per_view"]
-    title = f"Hand-eye calibration: {key}"
-    figures = [
-        (f"{numbers['residual_mm']:.2f} mm, {numbers['residual_deg']:.3f} deg", "by which the views disagree (rms)"),
-        (f"{numbers['rms_px']:.2f} px", "rms of the corners"),
-    ]
-    told = f"{len(views)} views, written to {numbers['out']}"
-    parts = [_head(title, told, numbers["warnings"], figures)]
-    rows = [[f"{value:.6f}" for value in row] for row in numbers["X_EC"]]
-    parts += [f"<h2>{key}</h2>", _table(("x", "y", "z", "position [m]"), rows)]
-    spread = numbers["X_EC_sigma"]
-    rows = [(a, f"{d:.3g}", f"{p:.3g}") for a, d, p in zip("xyz", spread["rotation_deg"], spread["position_mm"])]
-    parts += ["<h2>Standard deviations</h2>", "<p class='note'>By leaving out one view at a time.</p>"]
-    parts += [_table(("axis", "rotation [deg]", "position [mm]"), rows), "<h2>Views</h2>"]
-    names = [view["image"] for view in views]
-    parts.append(_bars(names, [view["residual_mm"] for view in views], [False] * len(views), "mm"))
-    columns = ("rms_px", "residual_deg", "residual_mm", "left_out_deg", "left_out_mm")
-    rows = [(view["image"], *(f"{view[column]:.3f}" for column in columns)) for view in views]
-    parts.append(_table(("view", "rms [px]", "deg", "mm", "deg, view left out", "mm, view left out"), rows))
-    return _page(title, [*parts, "<h2>Coverage</h2>", _map(corners, None, size, "corners of all views")])
-
-
-def _page(title: str, parts: Sequence[str]) -> str:
+def page(title: str, parts: Sequence[str]) -> str:
     head = f"<meta charset='utf-8'><title>{html.escape(title)}</title><style>{_STYLE}</style>"
     return f"<!doctype html><html lang='en'><head>{head}</head><body>{''.join(parts)}</body></html>\n"
 
 
-def _head(title: str, told: str, warnings: Sequence[str], figures: Sequence[tuple[str, str]]) -> str:
+def head(title: str, told: str, warnings: Sequence[str], figures: Sequence[tuple[str, str]]) -> str:
     out = f"<h1>{html.escape(title)}</h1><p class='note'>{html.escape(told)}</p>"
     out += "".join(f"<div class='warn'>{html.escape(text)}</div>" for text in warnings)
     return out + "<p>" + " &emsp; ".join(f"<span class='big'>{n}</span> {what}" for n, what in figures) + "</p>"
@@ -116,14 +92,14 @@ def _triangulation(numbers: dict[str, Any]) -> str:
     return (
         "<h2>Triangulated points</h2><p>The rms does not tell how good a calibration is. Calibrated once from every "
         "second pair and once from the others, the distance of one and the same point comes out different by:</p>"
-        + _table(("distance", "split-half difference [mm]", "standard deviation [mm]"), rows)
+        + table(("distance", "split-half difference [mm]", "standard deviation [mm]"), rows)
         + "<p class='note'>About twice the standard deviation is to be expected, since a half has half the views. "
         "Much more says that something is not as the model has it: lens, board, pairing. The triangulated pitch is "
         f"{100 * pitch['mean']:.2f} % of the true one, each +- {100 * pitch['standard_deviation']:.2f} %.</p>"
     )
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[Any]], marked: Sequence[bool] | None = None) -> str:
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]], marked: Sequence[bool] | None = None) -> str:
     out = "<tr>" + "".join(f"<th>{html.escape(name)}</th>" for name in head) + "</tr>"
     for k, row in enumerate(rows):
         kind = " class='out'" if marked is not None and marked[k] else ""
@@ -131,7 +107,9 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[Any]], marked: Sequence[
     return f"<table>{out}</table>"
 
 
-def _map(px: Sequence[np.ndarray], residuals: Sequence[np.ndarray] | None, size: tuple[int, int], caption: str) -> str:
+def corner_map(
+    px: Sequence[np.ndarray], residuals: Sequence[np.ndarray] | None, size: tuple[int, int], caption: str
+) -> str:
     """The corners of each view in its colour, their residuals enlarged, empty cells tinted."""
     (width, height), parts = size, []
     w, h = np.array(size) / _GRID
@@ -149,7 +127,7 @@ def _map(px: Sequence[np.ndarray], residuals: Sequence[np.ndarray] | None, size:
     return f"<figure>{svg}<figcaption class='note'>{html.escape(caption)}</figcaption></figure>"
 
 
-def _bars(names: Sequence[str], values: Sequence[float], marked: Sequence[bool], unit: str) -> str:
+def bars(names: Sequence[str], values: Sequence[float], marked: Sequence[bool], unit: str) -> str:
     top, parts = max(max(values), 1e-12), []
     for k, (name, value) in enumerate(zip(names, values)):
         y, length, color = 18 * k, 440 * value / top, "#b3261e" if marked[k] else "#4a7fb5"

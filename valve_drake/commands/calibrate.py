@@ -42,7 +42,9 @@ def command(options: argparse.Namespace) -> int:
 
     board = parse_board(options.board, options.pitch)
     if options.kind == "hand-eye":
-        report = reports.hand_eye(
+        from valve_drake.camera import hand_eye_report
+
+        report = hand_eye_report.hand_eye(
             options.images, options.poses, board, options.out, options.camera, options.eye_to_hand
         )
     else:
