@@ -1,6 +1,5 @@
 """The commands. Exit 0 success, 1 the operation failed, 2 bad input or scenario, 3 damaged log; errors are one line."""
 
-import sys
 from collections.abc import Sequence
 
 from valve_drake.checks import ConfigError, OperationFailed
@@ -17,6 +16,7 @@ from valve_drake.commands import (
     twin,
 )
 from valve_drake.commands.common import BAD_INPUT, FAILED, Parser
+from valve_drake.console import complain
 
 COMMANDS = (run, twin, draw, teach, review, experiment, replay, recover, estimate, calibrate)  # as --help lists them
 
@@ -27,13 +27,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
         return options.command(options)
     except ConfigError as error:
-        print(f"valve-drake: {error}", file=sys.stderr)
+        complain(error)
         return BAD_INPUT
     except OperationFailed as error:
-        print(f"valve-drake: {error}", file=sys.stderr)
+        complain(error)
         return FAILED
     except KeyboardInterrupt:
-        print("valve-drake: interrupted", file=sys.stderr)
+        complain("interrupted")
         return FAILED
 
 

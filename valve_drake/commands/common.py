@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from typing import NoReturn, TypeAlias
 
 from valve_drake.checks import ConfigError
+from valve_drake.console import console as make_console
+from valve_drake.console import styled
 
 OK, FAILED, BAD_INPUT, DAMAGED = 0, 1, 2, 3  # exit codes
 Subcommands: TypeAlias = "argparse._SubParsersAction[Parser]"
@@ -64,9 +66,7 @@ def stopper() -> Iterator[Callable[[], bool]]:
 @contextlib.contextmanager
 def display(wanted: bool) -> Iterator[Callable]:
     """A line that shows mode, simulated time and real-time factor, on a terminal only."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
+    console = make_console(stderr=True)
     if not wanted or not console.is_terminal:
         yield lambda progress: None
         return
@@ -76,9 +76,10 @@ def display(wanted: bool) -> Iterator[Callable]:
         def show(progress: object) -> None:
             mode = progress.mode
             factor = progress.sim_time / max(progress.wall_time, 1e-9)
-            status.update(f"[bold]{mode.mode}[/]  {progress.sim_time:6.2f} s  x{factor:.2f} real time")
+            times = f"  {progress.sim_time:6.2f} s  x{factor:.2f} real time"
+            status.update(styled((mode.mode, "bold"), times))
             if mode.mode != last[0]:
-                console.print(f"{mode.since:7.2f} s  [bold]{mode.mode:<15}[/] {mode.reason}", highlight=False)
+                console.print(styled(f"{mode.since:7.2f} s  ", (f"{mode.mode:<15}", "bold"), f" {mode.reason}"))
                 last[0] = mode.mode
 
         yield show
@@ -86,17 +87,17 @@ def display(wanted: bool) -> Iterator[Callable]:
 
 def print_summary(console: object, s: object) -> None:
     """What happened in a run: a line for each mode, the verdict, angles and forces."""
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table("mode", "start [s]", "time [s]", "why", box=None, header_style="dim")
     for span in s.spans:
         retry = f" (retry {span.attempt})" if span.attempt else ""
-        table.add_row(span.mode + retry, f"{span.start:.2f}", f"{span.duration:.2f}", escape(span.reason))
+        table.add_row(span.mode + retry, f"{span.start:.2f}", f"{span.duration:.2f}", span.reason)
     console.print(table)
     color = "green" if s.outcome == "done" else "red"
     verdict = s.verdict or "-"
-    console.print(f"[bold {color}]{s.outcome or 'unfinished'}[/]  verdict [bold]{verdict}[/]  {escape(s.reason)}")
+    outcome = (s.outcome or "unfinished", f"bold {color}")
+    console.print(styled(outcome, "  verdict ", (verdict, "bold"), f"  {s.reason}"))
     angles = {"commanded": s.command_rad, "camera": s.angle_camera_rad}
     angles |= {"hands": s.angle_hands_rad, "true": s.angle_true_rad}
     known = [f"{k} {round(math.degrees(v), 2) + 0.0:.2f} deg" for k, v in angles.items() if v is not None]

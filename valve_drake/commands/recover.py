@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from valve_drake.commands.common import DAMAGED, OK, Subcommands
+from valve_drake.console import say
 
 
 def add(commands: Subcommands) -> None:
@@ -18,7 +19,7 @@ def command(options: argparse.Namespace) -> int:
 
     source = recover(options.log, options.out)
     count = sum(topic.count for topic in source.topics.values())
-    print(f"{options.out}: {count} messages up to {source.end:.3f} s")
+    say(f"{options.out}: {count} messages up to {source.end:.3f} s")
     for line in source.damage:
-        print(f"  {line}")
+        say(f"  {line}")
     return DAMAGED if source.damage else OK

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from valve_drake.checks import ConfigError
 from valve_drake.commands.common import DAMAGED, OK, Subcommands, print_summary
+from valve_drake.console import console as make_console
+from valve_drake.console import say, styled
 
 
 def add(commands: Subcommands) -> None:
@@ -44,7 +46,7 @@ def command(options: argparse.Namespace) -> int:
         print(json.dumps(facts(subject) | {"html": str(html) if html else None}))
     else:
         _print_review(found, subject)
-        print(f"page {html}")
+        say(f"page {html}")
     return OK if all(one.integrity.sound for one in found) else DAMAGED
 
 
@@ -54,32 +56,30 @@ def _keep_apart(option: str, path: Path, logs: Sequence[Path]) -> None:
 
 
 def _print_review(found: list, subject: object) -> None:
-    from rich.console import Console
-
     from valve_drake.analysis.report import parting_values
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     for one in found:
         if len(found) > 1:
-            console.print(f"{one.log.path}:", markup=False)
+            console.print(f"{one.log.path}:")
         print_summary(console, one.summary)
         for line in one.integrity.troubles:
-            console.print(f"damaged: {line}", markup=False)
+            console.print(f"damaged: {line}")
         for row in one.integrity.late[:10]:
             missing = sum(gap.missing for gap in row.gaps)
-            console.print(f"gaps: {row.topic} {len(row.gaps)}, {missing} messages missing", markup=False)
+            console.print(f"gaps: {row.topic} {len(row.gaps)}, {missing} messages missing")
         whole = "whole" if one.integrity.sound else "not whole"
         console.print(f"the log is {whole}: {one.integrity.messages} messages, {len(one.integrity.topics)} topics")
     if len(found) == 1:
         return
     first = subject.first
     if first is None:
-        word = "[bold green]identical[/]" if subject.sound else "no difference"
-        console.print(f"{word}: what both hold is equal to the bit")
+        word = ("identical", "bold green") if subject.sound else "no difference"
+        console.print(styled(word, ": what both hold is equal to the bit"))
         return
     a, b = parting_values(first)
     words = f"{first.field}: {a} and {b}" if first.field else f"only in {found[0 if b is None else 1].log.path}"
-    console.print(f"they part at t = {first.time:.6f} s, {first.topic} {words}", markup=False)
+    console.print(f"they part at t = {first.time:.6f} s, {first.topic} {words}")
 
 
 def _export(options: argparse.Namespace) -> int:
@@ -98,7 +98,7 @@ def _export(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"topic": options.topic, "messages": count, "out": str(out), "damage": log.damage}))
     else:
-        print(f"{out}: {count} messages of {options.topic}")
+        say(f"{out}: {count} messages of {options.topic}")
         for line in log.damage:
-            print(f"  {line}")
+            say(f"  {line}")
     return DAMAGED if log.damage else OK
