@@ -87,11 +87,13 @@ class Run:
     details: set
 
 
-def drive(mode, wheels, scene, *, limit=40.0, config=CONFIG, alter=None, arms=None, visible=None, watch=None):
+def drive(
+    mode, wheels, scene, *, limit=40.0, config=CONFIG, alter=None, arms=None, visible=None, watch=None, scale=1.0
+):
     """Runs one activation until it ends -> Run.
 
     alter(t, messages) changes what is seen, visible() says whether anything is, arms(t) is a joint speed,
-    watch(robot_state, mode, messages) is called each tick.
+    watch(robot_state, mode, messages) is called each tick. scale: of the odometry's distances.
     """
     memory, poses, twists, details = Memory(), [], [], set()
     seen = (StereoPosition(), RectangleEstimate(), Stance())
@@ -101,7 +103,7 @@ def drive(mode, wheels, scene, *, limit=40.0, config=CONFIG, alter=None, arms=No
         if k % 8 == 4 and (visible is None or visible()):
             seen = scene.look(t, wheels.pose)
             seen = alter(t, seen) if alter else seen
-        odometry = np.concatenate([wheels.pose, wheels.twist])
+        odometry = np.concatenate([wheels.pose, wheels.twist]) * [scale, scale, 1, scale, 1]
         if scene.noise:
             odometry[:3] += scene.rng.normal(size=3) * np.array([3e-4, 3e-4, 3e-4])
         robot = RobotState(time=t, odometry=odometry, left_arm_velocity=np.full(6, arms(t) if arms else 0.0))
@@ -471,3 +473,25 @@ def test_block_refuses_a_wrong_message_and_needs_the_robot_state():
         rig(stance=StereoPosition(), mode=ModeState(mode="fine_approach", activation=1)).run(0.1)
     with pytest.raises(AttributeError):
         Rig(BaseApproachSystem(CONFIG), mode=ModeState(mode="retreat", activation=1)).run(0.1)
+
+
+# ---------------------------------------------------------------- odometry
+
+
+@pytest.mark.parametrize("scale, ends", [(0.5, "fault"), (0.75, ""), (1.0, ""), (1.3, ""), (2.0, "fault")])
+def test_odometry_that_counts_half_or_double_is_a_fault_in_rough_approach(scale, ends):
+    """The cameras see the marker come nearer by another length than the wheels count."""
+    rng = np.random.default_rng(3)
+    scene = Scene(np.array([6.0, 0.0, 0.0]), rng)
+    wheels = Wheels(np.zeros(3))
+
+    def alter(t, seen):  # what is seen lies in the odometry's frame, which has moved on by (scale - 1) of the way
+        position, estimate, stance = seen
+        shift = np.array([(scale - 1.0) * wheels.pose[0], (scale - 1.0) * wheels.pose[1], 0.0])
+        return dc.replace(position, p_LV=position.p_LV + shift), estimate, stance
+
+    run = drive(Mode.ROUGH_APPROACH, wheels, scene, alter=alter, scale=scale)
+    assert run.status.verdict == ends
+    assert run.status.state == ("failed" if ends else "succeeded")
+    if ends:
+        assert "odometry: the marker moved by" in run.status.detail

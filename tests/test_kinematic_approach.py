@@ -1,6 +1,8 @@
 """kinematic_approach: free, bounded motions of both arms; where to stand; the looks before and after the turn."""
 
 import dataclasses as dc
+import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -39,6 +41,7 @@ from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
+from valve_drake.supervisor.supervisor import SupervisorConfig
 
 CONFIG = KinematicApproachConfig()
 STANCE = StanceConfig(distance_min=0.70, distance_max=0.78)  # fewer places to try: quicker
@@ -467,10 +470,41 @@ def test_no_way_home_fails_with_a_verdict(base):
     assert "home" in status.detail
 
 
-def test_a_marker_that_is_not_seen_again_leaves_verify_running(base):
+def turning(bench: Bench, rate: Callable[[float], float]) -> None:
+    """The valve turns on by itself: rate(time) [rad/s]."""
+    bench.X_OV = turned(bench.X_OV, rate(bench.time) * TICK)
+
+
+def test_a_marker_that_is_not_seen_again_ends_unverified_with_what_the_hands_know(base):
     bench = Bench(base).at_standoff()
+    bench.turn = TurnState(angle=1.569)
     bench.seen = False
-    assert bench.run(Mode.VERIFY, limit=6.0).state == "running"
+    status = bench.run(Mode.VERIFY, limit=30.0)
+    assert (status.state, status.verdict) == ("failed", "unverified")
+    assert status.detail == "camera does not see the marker, hands turned 89.90 deg of 90.00 deg"
+    assert bench.time < SupervisorConfig().deadline["verify"]  # its own word comes before the supervisor's timeout
+
+
+def test_a_valve_that_turns_on_after_the_hands_let_go_is_not_turned(base):
+    """It would be within the tolerance at the moment of the first looks, and is not when the run has ended."""
+    bench = Bench(base).at_standoff()
+    bench.noise = bench.noise / 10  # as near the valve
+    bench.turn, bench.X_OV = TurnState(angle=QUARTER), turned(X_OV, QUARTER)
+    status = bench.run(Mode.VERIFY, limit=30.0, each=lambda b: turning(b, lambda t: -np.radians(0.3)))
+    assert (status.state, status.verdict) == ("failed", "unverified")
+    assert status.value == pytest.approx(turn_between(X_OV, bench.X_OV), abs=0.005)
+    assert re.search(r"turning by -0\.(29|3\d) deg/s", status.detail) and "hands turned 90.00 deg of 90.00 deg" in status.detail
+
+
+@pytest.mark.parametrize("rest, state", [(np.radians(0.8), "succeeded"), (np.radians(3.0), "failed")])
+def test_verify_waits_for_a_valve_that_comes_to_rest_and_judges_it_there(base, rest, state):
+    bench = Bench(base).at_standoff()
+    bench.noise = bench.noise / 10
+    bench.turn, bench.X_OV = TurnState(angle=QUARTER), turned(X_OV, QUARTER)
+    still = bench.time + 5.0
+    status = bench.run(Mode.VERIFY, each=lambda b: turning(b, lambda t: -rest / 5.0 if t < still else 0.0))
+    assert status.state == state
+    assert status.value == pytest.approx(QUARTER - rest, abs=0.002)
 
 
 # ---------------------------------------------------------------- activations, config, block

@@ -486,6 +486,24 @@ def test_the_deadline_of_turn_grows_with_the_angle():
     assert deadline(CONFIG, State()) == np.inf
 
 
+def test_a_run_that_loses_its_way_within_all_deadlines_of_its_modes_ends_as_a_timeout():
+    """Search and approach by turns, each well within its own time: 3 s a mode, and no retry that is counted."""
+    bench = bring_to(Mode.ROUGH_APPROACH)
+    bench.state = dc.replace(bench.state, since=bench.time)
+    while bench.state.mode not in TERMINAL:
+        bench.tick()
+        bench.state = dc.replace(bench.state, since=bench.time)
+    assert bench.state.verdict == Verdict.TIMEOUT and "the run took more than" in bench.state.reason
+    assert bench.time == pytest.approx(CONFIG.run_deadline + CONFIG.turn_allowance * OPEN.angle, abs=1.0)
+
+
+def test_the_way_off_the_valve_is_not_cut_short_by_the_runs_deadline():
+    bench = bring_to(Mode.VERIFY)
+    bench.time += 10 * CONFIG.run_deadline
+    bench.state = dc.replace(bench.state, since=bench.time)
+    assert bench.until_end(succeed).verdict == Verdict.TURNED
+
+
 def test_what_does_not_follow_its_command_is_a_fault():
     report = SelectorReport(time=0.0, astray=("left_arm",))
     assert find_fault(CONFIG, 0.0, Health(), report) == "left_arm does not follow the command"

@@ -287,6 +287,7 @@ class Verdict(enum.StrEnum):
     MARKER_LOST = "marker_lost"
     GRASP_MISSED = "grasp_missed"
     TIMEOUT = "timeout"
+    UNVERIFIED = "unverified"  # the hands turned it, but the camera could not confirm an angle that stands still
     FAULT = "fault"
     STOPPED = "stopped"
 

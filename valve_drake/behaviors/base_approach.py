@@ -72,6 +72,8 @@ class BaseApproachConfig:
     still_rate: float = 0.02  # [rad/s]
     attempts: int = 4  # at coming in straight
     stance_patience: float = 5.0  # wait for a first stance [s]
+    odometry_check: float = 0.6  # driven so far, odometry is held against the cameras [m]
+    odometry_error: float = 0.35  # of what was driven: more is a fault; raise it for wheels that slip
     retreat_distance: float = 0.5  # [m]
     retreat_speed: float = 0.2  # [m/s]
     arms_still: float = 0.05  # joint speed below which the arms are still [rad/s]
@@ -114,6 +116,7 @@ class Memory:
     twist: np.ndarray = dc.field(default_factory=lambda: np.zeros(2))  # command [m/s, rad/s]
     start: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # base at the activation [m, m, rad]
     marker: Track = Track()  # stage 1: heading means nothing
+    first_seen: np.ndarray | None = None  # marker's x, y when it was sure first, and the base's then [m]
     panel: Track = Track()  # a point of its plane, and the heading of the normal into it
     stance: Track = Track()
     phase: str = "plan"
@@ -197,6 +200,9 @@ def _rough(
         return m, np.zeros(2)
     x, y, heading = state.odometry[:3]
     p = m.marker.median
+    m = _watch_odometry(config, m, state.odometry[:2])
+    if m.result == "failed":
+        return m, np.zeros(2)
     distance = float(np.hypot(p[0] - x, p[1] - y))
     bearing = wrap(float(np.arctan2(p[1] - y, p[0] - x)) - heading)
     m = dc.replace(
@@ -211,6 +217,22 @@ def _rough(
         forward = _drive(config, max(distance - config.rough_stop, 0.0), config.speed, dt) * np.cos(bearing)
     rate = _turn(config, bearing, dt) if distance > config.rough_stop else 0.0
     return m, np.array([forward, rate])
+
+
+def _watch_odometry(config: BaseApproachConfig, m: Memory, base: np.ndarray) -> Memory:
+    """The marker does not move: where it seems to, in the odometry's frame, the odometry counts wrong.
+
+    A fault, since every approach and the verify of the turn's place stand on the odometry.
+    """
+    marker = m.marker.median[:2]
+    if m.first_seen is None:
+        return dc.replace(m, first_seen=np.concatenate([marker, base])) if _sure(config, m.marker) else m
+    driven = float(np.linalg.norm(base - m.first_seen[2:]))
+    moved = float(np.linalg.norm(marker - m.first_seen[:2]))
+    if driven < config.odometry_check or moved < config.odometry_error * driven:
+        return m
+    detail = f"odometry: the marker moved by {moved:.2f} m while the base counted {driven:.2f} m"
+    return _end(m, "failed", Verdict.FAULT, detail)[0]
 
 
 # ---------------------------------------------------------------- stage 2

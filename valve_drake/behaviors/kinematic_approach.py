@@ -64,6 +64,9 @@ class KinematicApproachConfig:
     gripper_force: float = 40.0  # while opening [N]
     stance_period: float = 0.5  # between two searches for the stance [s]
     angle_tolerance: float = 0.035  # camera angle against the command that counts as turned [rad]
+    still_rate: float = 0.0017  # a valve that turns slower stands still; its final angle is taken then [rad/s]
+    still_time: float = 1.5  # estimates of so long tell how fast it turns; longer tells a slower drift [s]
+    look_time: float = 8.0  # verify gives up looking after this: no marker, or the valve does not stand still [s]
 
     def check(self) -> None:
         require(len(self.home) == 6, "kinematic_approach.home", "6 joint angles", self.home)
@@ -350,8 +353,11 @@ class KinematicApproach:
         if m.phase != "look":
             return m
         m = self._look(time, m, estimate)
-        if len(m.looks) < self.config.frames:
-            return m
+        newest = m.looks[-1].time if m.looks else 0.0
+        m = dc.replace(m, looks=tuple(look for look in m.looks if look.time >= newest - self.config.still_time))
+        drift = self._drift(m.looks)
+        if drift is None or abs(drift) > self.config.still_rate:
+            return self._unverified(m, time, mode, turn, drift) if time - m.since > self.config.look_time else m
         fused = fuse(m.looks)
         m = dc.replace(m, phase="end")
         if not fused.found or m.X_OV0 is None:
@@ -362,6 +368,35 @@ class KinematicApproach:
         state_now = "succeeded" if missing <= self.config.angle_tolerance else "failed"
         verdict = Verdict.NONE if state_now == "succeeded" else Verdict.SLIP
         return dc.replace(m, status=Status(time, m.activation, state_now, verdict, detail, 1.0, seen))
+
+    def _drift(self, looks: tuple[RectangleEstimate, ...]) -> float | None:
+        """How fast the valve turns, by the slope of its angle over the looks [rad/s]; None: too few of them to tell.
+
+        A valve without friction goes on turning when the hands let go of it: its angle at one moment is no result.
+        """
+        if len(looks) < self.config.frames or looks[-1].time - looks[0].time < 0.8 * self.config.still_time:
+            return None
+        poses = [compose(look.X_OL, look.X_LV) for look in looks]
+        slopes = [  # of all pairs: their median is not moved by one wrong estimate
+            # the rectangle repeats every quarter turn
+            wrap(turn_between(poses[i], poses[k]), np.pi / 2) / (looks[k].time - looks[i].time)
+            for k in range(len(looks))
+            for i in range(k)
+        ]
+        return float(np.median(slopes))
+
+    def _unverified(self, m: Memory, time: float, mode: ModeState, turn: TurnState, drift: float | None) -> Memory:
+        """The camera cannot say how far the valve is turned: what the hands felt is told, and not taken for it."""
+        asked, felt = np.degrees(mode.turn_angle), np.degrees(turn.angle)
+        hands = f"hands turned {felt:.2f} deg of {asked:.2f} deg"
+        m = dc.replace(m, phase="end")
+        if drift is None or m.X_OV0 is None:
+            return self._status(m, time, "failed", Verdict.UNVERIFIED, f"camera does not see the marker, {hands}")
+        fused = fuse(m.looks[-1:])
+        seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, turn.angle)
+        camera = f"camera sees {np.degrees(seen):.2f} deg, turning by {np.degrees(drift):+.2f} deg/s"
+        status = Status(time, m.activation, "failed", Verdict.UNVERIFIED, f"{camera}, {hands}", 1.0, seen)
+        return dc.replace(m, status=status)
 
     def seen_angle(self, X_OV0: np.ndarray, X_OV1: np.ndarray, axis_known: bool, by_hands: float) -> float:
         """The turned angle by camera [rad]. The rectangle repeats every quarter turn, with the green marks every half:

@@ -16,9 +16,10 @@ One block owns each mode: its Status, carrying this activation's number, ends it
     fault or operator's stop                    -> hands at the handles: release, then failed or stopped;
                                                    elsewhere at once, the robot held still
 
-Retries are counted over the run and bounded, and every mode has a deadline, so a run always ends. `verify` decides
-`turned` by camera, even if the turn itself had ended with another verdict; otherwise the first verdict stays. A release
-that fails ends the run at once: command_selector opens the hands in failed and stopped.
+Retries are counted over the run and bounded; every mode has a deadline, and so has the run (a robot whose odometry is
+wrong could search and drive for minutes within those of its modes). `verify` decides `turned` by camera, even if the
+turn itself had ended with another verdict; otherwise the first verdict stays. A release that fails ends the run at
+once: command_selector opens the hands in failed and stopped.
 """
 
 import dataclasses as dc
@@ -56,6 +57,7 @@ OWNER = {
 BEHAVIORS = tuple(dict.fromkeys(OWNER.values()))
 TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
 CONTACT = (Mode.SERVO, Mode.GRASP, Mode.TURN)  # the hands are at the handles
+ENDING = (Mode.RELEASE, Mode.VERIFY, Mode.RETREAT)  # the way off the valve: their own deadlines bound them
 WATCHED = (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.MEASURE)  # valve_search says when the marker is lost
 
 # What a behaviour may give as the reason of its failure; anything else is a fault of the program.
@@ -73,7 +75,7 @@ def _deadlines() -> dict[str, float]:
         "grasp": 12.0,
         "turn": 60.0,
         "release": 8.0,
-        "verify": 12.0,
+        "verify": 20.0,
         "retreat": 15.0,
     }
 
@@ -83,7 +85,8 @@ class SupervisorConfig:
     """Scenario key `supervisor`."""
 
     deadline: dict[str, float] = dc.field(default_factory=_deadlines)  # of each mode [s]
-    turn_allowance: float = 20.0  # added to the deadline of turn [s/rad]
+    turn_allowance: float = 20.0  # added to the deadlines of turn and of the run [s/rad]
+    run_deadline: float = 160.0  # from the operator's command until the run gives up; a good one takes 60 s [s]
     retries: dict[str, int] = dc.field(
         default_factory=lambda: {"marker_lost": 2, "measure": 2, "servo": 2, "grasp": 2}
     )  # in a run, by what failed
@@ -105,7 +108,7 @@ class SupervisorConfig:
             require(isinstance(count, int) and 0 <= count <= 10, f"{block}.retries.{name}", "within [0, 10]", count)
         for name, value in self.max_age.items():
             require(value > 0, f"{block}.max_age.{name}", "> 0", value)
-        require_positive(self, block, ("turn_allowance", "other_age", "report_age", "angle_limit"))
+        require_positive(self, block, ("turn_allowance", "run_deadline", "other_age", "report_age", "angle_limit"))
 
 
 @dc.dataclass(frozen=True)
@@ -115,6 +118,7 @@ class State:
     mode: Mode = Mode.IDLE
     activation: int = 0
     since: float = 0.0  # [s]
+    began: float = 0.0  # when the operator's command was taken [s]
     turn_angle: float = 0.0  # [rad]
     verdict: Verdict = Verdict.NONE
     reason: str = ""
@@ -172,6 +176,9 @@ def step(
         return _fail(config, s, time, "valve_search", watch)
     if time - s.since > deadline(config, s):
         return _give_up(s, time, Verdict.TIMEOUT, f"{s.mode.value} took more than {deadline(config, s):.0f} s")
+    limit = config.run_deadline + config.turn_allowance * abs(s.turn_angle)
+    if s.mode not in ENDING and time - s.began > limit:
+        return _give_up(s, time, Verdict.TIMEOUT, f"the run took more than {limit:.0f} s")
     return s
 
 
@@ -224,7 +231,7 @@ def _begin(config: SupervisorConfig, s: State, time: float, request: str, angle:
     if fault:
         return _enter(s, time, Mode.FAILED, fault, verdict=Verdict.FAULT)
     sign = 1.0 if request == "open" else -1.0
-    return _enter(s, time, Mode.SEARCH, f"operator: {request}", turn_angle=sign * angle)
+    return _enter(s, time, Mode.SEARCH, f"operator: {request}", turn_angle=sign * angle, began=time)
 
 
 def _aborting(s: State) -> bool:
