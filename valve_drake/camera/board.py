@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from valve_drake.camera.image_file import read_image
 from valve_drake.checks import ConfigError, require
 
 _DONE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
@@ -71,22 +72,6 @@ def find_images(patterns: Sequence[str], key: str) -> list[Path]:
     if not names:
         raise ConfigError(f"{key} {' '.join(patterns)}: no such image")
     return sorted(map(Path, names), key=lambda path: (natural(path.name), str(path)))
-
-
-def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
-    """An image file, BGR or grey, uint8. Raises ConfigError naming the file."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read ({type(error).__name__})"
-        raise ConfigError(f"image {path}: {reason}") from error
-    if not data:
-        raise ConfigError(f"image {path}: empty file")
-    # A turn noted in the file is not applied: the calibration is about the pixels as the sensor has them.
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise ConfigError(f"image {path}: not an image")
-    return image
 
 
 def read_images(paths: Sequence[Path]) -> list[np.ndarray]:

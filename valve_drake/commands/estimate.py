@@ -29,8 +29,9 @@ def command(options: argparse.Namespace) -> int:
     import numpy as np
 
     from valve_drake import frames
-    from valve_drake.camera.board import parse_pair, read_image
+    from valve_drake.camera.board import parse_pair
     from valve_drake.camera.calibration_file import load_calibration
+    from valve_drake.camera.image_file import read_image
     from valve_drake.camera.lens import StereoHead
     from valve_drake.perception.photograph import look
 
