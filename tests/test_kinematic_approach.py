@@ -493,7 +493,8 @@ def test_a_valve_that_turns_on_after_the_hands_let_go_is_not_turned(base):
     status = bench.run(Mode.VERIFY, limit=30.0, each=lambda b: turning(b, lambda t: -np.radians(0.3)))
     assert (status.state, status.verdict) == ("failed", "unverified")
     assert status.value == pytest.approx(turn_between(X_OV, bench.X_OV), abs=0.005)
-    assert re.search(r"turning by -0\.(29|3\d) deg/s", status.detail) and "hands turned 90.00 deg of 90.00 deg" in status.detail
+    assert re.search(r"turning by -0\.(29|3\d) deg/s", status.detail)
+    assert "hands turned 90.00 deg of 90.00 deg" in status.detail
 
 
 @pytest.mark.parametrize("rest, state", [(np.radians(0.8), "succeeded"), (np.radians(3.0), "failed")])
