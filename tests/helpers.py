@@ -8,13 +8,13 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, PortDataType
 
 from valve_drake.messages import Message
-from valve_drake.ports import SLOT, TICK, Block, Inputs
+from valve_drake.ports import SLOT, TICK, Block, Inputs, Kind, Outputs
 
 
 class Rig:
     """One block in a simulator. `inputs` fixes ports by name; those left out stay open."""
 
-    def __init__(self, block: Block, **inputs: Any):
+    def __init__(self, block: Block[Any, Any], **inputs: Any):
         self.block = block
         self.simulator = Simulator(block)
         self.context = self.simulator.get_mutable_context()
@@ -32,19 +32,19 @@ class Rig:
         return self.block.GetOutputPort(port).Eval(self.context if context is None else context)
 
 
-class SourceBlock(Block):
+class SourceBlock(Block[Inputs, None]):
     """A block without inputs whose single output is `value(time)`."""
 
-    def __init__(self, name: str, kind: type, value: Callable[[float], Any], *, period: float = TICK, slot: int = 0):
+    def __init__(self, name: str, kind: Kind, value: Callable[[float], Any], *, period: float = TICK, slot: int = 0):
         self.OUTPUTS = {"value": kind}
         self._value = value
         super().__init__(name, period=period, slot=slot)
 
-    def step(self, time: float, inputs: Inputs, memory: Any) -> tuple[Any, dict[str, Any]]:
+    def step(self, time: float, inputs: Inputs, memory: None) -> tuple[None, Outputs]:
         return None, {"value": self._value(time)}
 
 
-def ports(block: Block) -> dict[str, str | int]:
+def ports(block: Block[Any, Any]) -> dict[str, str | int]:
     """Port name -> "in"/"out" and vector size or "abstract", in order."""
     found = {}
     for direction, count, get in (

@@ -471,7 +471,7 @@ def test_block_clones_are_independent():
 def test_block_refuses_a_wrong_message_and_needs_the_robot_state():
     with pytest.raises(TypeError, match="want Stance"):
         rig(stance=StereoPosition(), mode=ModeState(mode="fine_approach", activation=1)).run(0.1)
-    with pytest.raises(AttributeError):
+    with pytest.raises(RuntimeError, match="robot_state.*base_approach.*nothing is connected"):
         Rig(BaseApproachSystem(CONFIG), mode=ModeState(mode="retreat", activation=1)).run(0.1)
 
 

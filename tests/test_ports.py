@@ -1,6 +1,8 @@
 """ports: a Block steps at its own times on its own memory, holds its outputs, and refuses what does not fit."""
 
 import dataclasses as dc
+import functools
+from typing import Annotated
 
 import numpy as np
 import pytest
@@ -10,13 +12,17 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from valve_drake.messages import Health, Status, StereoPosition
-from valve_drake.ports import SLOT, TICK, Block, profile
+from valve_drake.ports import SLOT, TICK, Block, Inputs, lock, profile
 
 
-class Counter(Block):
-    """Counts its steps; adds up its inputs."""
+class CounterInputs(Inputs):
+    a: Annotated[np.ndarray, 2]
+    status: Status = Status()
 
-    INPUTS = {"a": 2, "status": Status}
+
+class Counter(Block[CounterInputs, int]):
+    """Counts its steps; multiplies its input."""
+
     OUTPUTS = {"sum": 2, "report": StereoPosition}
 
     def __init__(self, **timing):
@@ -28,10 +34,9 @@ class Counter(Block):
 
     def step(self, time, inputs, memory):
         self.times.append(time)
-        a = inputs.a
-        out = {"report": StereoPosition(time=time, sequence=memory, found=inputs.status is not None)}
-        if a is not None:
-            out["sum"] = a * (memory + 1)
+        out = {"report": StereoPosition(time=time, sequence=memory)}
+        if inputs.status.state == "running":
+            out["sum"] = inputs.a * (memory + 1)
         return memory + 1, out
 
 
@@ -68,16 +73,73 @@ def test_outputs_before_the_first_step_are_the_defaults():
     assert rig.read("sum").tolist() == [0, 0]
 
 
-def test_an_open_port_reads_as_none_and_a_connected_one_as_its_value():
-    rig = Rig(Counter()).run(TICK)
-    assert not rig.read("report").found
+RUNNING = Status(state="running")
+
+
+def test_an_open_port_reads_as_its_default_and_a_connected_one_as_its_value():
+    rig = Rig(Counter()).run(TICK)  # `status` is the default, so that `a` is not read
     assert rig.read("sum").tolist() == [0, 0]  # left out of the step's outputs: kept
-    rig.fix(a=[1.0, 2.0], status=Status())
+    rig.fix(a=[1.0, 2.0], status=RUNNING)
     rig.run(2 * TICK)
-    assert rig.read("report").found
     assert rig.read("sum").tolist() == [2, 4]
     rig.run(3 * TICK)
     assert rig.read("sum").tolist() == [3, 6]
+
+
+def test_an_open_port_without_a_default_is_an_error_that_names_it_when_it_is_read():
+    with pytest.raises(RuntimeError, match="a.*counter.*nothing is connected"):
+        Rig(Counter(), status=RUNNING).run(TICK)
+
+
+def test_a_port_that_may_be_none_says_so():
+    class ListenerInputs(Inputs):
+        health: Health | None = None
+
+    class Listener(Block[ListenerInputs, list]):
+        def initial(self):
+            return []
+
+        def step(self, time, inputs, memory):
+            return [*memory, inputs.health], {}
+
+    rig = Rig(Listener("listener")).run(TICK)
+    rig.fix(health=Health())
+    heard = rig.run(2 * TICK).block.memory(rig.context)
+    assert heard[0] is None and type(heard[1]) is Health
+
+
+def test_unknown_ports_are_errors_and_no_port_can_be_written():
+    def reading(work):
+        class Curious(Counter):
+            def step(self, time, inputs, memory):
+                work(inputs)
+                return memory, {}
+
+        return Rig(Curious(), a=[1.0, 2.0])
+
+    with pytest.raises(AttributeError, match="statsu"):
+        reading(lambda inputs: inputs.statsu).run(TICK)
+    with pytest.raises(KeyError, match="statsu"):
+        reading(lambda inputs: inputs["statsu"]).run(TICK)
+    with pytest.raises(AttributeError, match="a can only be read"):
+        reading(lambda inputs: setattr(inputs, "a", 1)).run(TICK)
+    with pytest.raises(TypeError, match="an input port is a message"):
+
+        class Wrong(Inputs):
+            a: float
+
+
+def test_ports_of_a_table_are_read_by_their_name():
+    class Tabled(Block[Inputs, None]):
+        INPUTS = {"base.odometry": 1, "status": Status}
+        OUTPUTS = {"sum": 1}
+
+        def step(self, time, inputs, memory):
+            return None, {"sum": inputs["base.odometry"] + inputs["status"].value}
+
+    rig = Rig(Tabled("tabled"), **{"base.odometry": [2.0], "status": Status(value=3.0)})
+    assert rig.run(TICK).read("sum").tolist() == [5.0]
+    assert ports(rig.block) == {"base.odometry": "in 1", "status": "in abstract", "sum": "out 1"}
 
 
 def test_a_block_reads_inputs_as_they_are_at_its_own_slot():
@@ -85,8 +147,10 @@ def test_a_block_reads_inputs_as_they_are_at_its_own_slot():
     builder = DiagramBuilder()
     source = builder.AddSystem(SourceBlock("clock", Status, lambda t: Status(time=t)))
 
-    class Reader(Block):
-        INPUTS = {"status": Status}
+    class ReaderInputs(Inputs):
+        status: Status
+
+    class Reader(Block[ReaderInputs, None]):
         OUTPUTS = {"age": 1}
 
         def step(self, time, inputs, memory):
@@ -108,7 +172,8 @@ def test_outputs_hold_between_updates():
 
 
 def test_clones_are_independent():
-    assert_clones_are_independent(lambda: Rig(Counter(), a=[1.0, 2.0]), {"a": [5.0, 6.0]}, ("sum", "report"))
+    make = functools.partial(Rig, a=[1.0, 2.0], status=RUNNING)
+    assert_clones_are_independent(lambda: make(Counter()), {"a": [5.0, 6.0]}, ("sum", "report"))
 
 
 def test_a_wrong_message_on_a_port_is_refused_with_the_port_named():
@@ -125,7 +190,7 @@ def test_a_wrong_output_is_refused_with_block_and_port_named():
         def step(self, time, inputs, memory):
             return None, {"report": Status()}
 
-    with pytest.raises(TypeError, match="wrong.report: want StereoPosition, got Status"):
+    with pytest.raises(TypeError, match="wrong.report: want .*StereoPosition.*, got Status"):
         Rig(Wrong("wrong")).run(TICK)
 
 
@@ -159,6 +224,35 @@ def test_the_memory_is_not_copied_by_drake():
     assert rig.block.memory(rig.context) is rig.block.memory(rig.context.Clone())
 
 
+@dc.dataclass(frozen=True)
+class Nested:
+    array: np.ndarray
+    parts: tuple
+    hands: dict
+
+
+def test_the_arrays_of_a_memory_are_locked_so_that_no_clone_can_be_changed():
+    class Careless(Block[Inputs, Nested]):
+        def initial(self):
+            return Nested(np.zeros(3), (np.zeros(2), [np.zeros(1)]), {"left": Nested(np.zeros(2), (), {})})
+
+        def step(self, time, inputs, memory):
+            array = memory.array + 1
+            return dc.replace(memory, array=array), {}
+
+    rig = Rig(Careless("careless")).run(0.1)
+    memory = rig.block.memory(rig.context)
+    assert memory is rig.block.memory(rig.context.Clone()) and memory.array[0] > 0
+    for array in (memory.array, memory.parts[0], memory.parts[1][0], memory.hands["left"].array):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 5.0
+
+
+def test_locking_leaves_what_is_no_array():
+    for value in (None, 3, "text", Status, Status(), (1, None, {"a": 2.0})):
+        lock(value)
+
+
 def test_a_source_block_says_its_value_of_the_time_in_slot_0():
     rig = Rig(SourceBlock("source", Status, lambda t: Status(time=t, value=10 * t)))
     assert ports(rig.block) == {"value": "out abstract"}
@@ -189,7 +283,9 @@ def test_an_error_of_who_is_read_is_not_taken_for_a_port_without_a_value():
 
     builder = DiagramBuilder()
     source, block = builder.AddSystem(Failing()), builder.AddSystem(Counter())
+    status = builder.AddSystem(SourceBlock("status", Status, lambda t: RUNNING))
     builder.Connect(source.GetOutputPort("a"), block.GetInputPort("a"))
+    builder.Connect(status.GetOutputPort("value"), block.GetInputPort("status"))
     with pytest.raises(RuntimeError, match="no image"):
         Simulator(builder.Build()).AdvanceTo(TICK)
 

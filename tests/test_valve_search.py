@@ -378,7 +378,7 @@ def test_block_clones_are_independent():
 def test_block_refuses_a_wrong_message_and_needs_the_mode():
     with pytest.raises(TypeError, match="want StereoPosition"):
         rig(position=RectangleEstimate()).run(0.1)
-    with pytest.raises(AttributeError):
+    with pytest.raises(RuntimeError, match="mode.*valve_search.*nothing is connected"):
         Rig(ValveSearchSystem(CONFIG, HEAD), robot_state=RobotState(history=np.zeros((1, 7)))).run(0.1)
 
 

@@ -1,36 +1,53 @@
-"""How a stage stands on Drake's ports: `Block`, the base of every LeafSystem of the program.
+"""`Block`, the base class of all LeafSystems of the program: typed input ports, a pure step(), outputs that hold.
 
-A block is a pure step: at fixed times it reads its inputs, and out come its memory and the messages that
-its output ports hold until the next step. All state is abstract state of the Context (nothing hidden in
-attributes), so a block can be cloned, replayed and tested alone.
+A block is a pure step: at fixed times it reads its inputs and returns its new memory and the messages that its output
+ports hold until the next step. All state is abstract state of the Context (nothing hidden in attributes), so a block
+can be cloned, replayed and tested alone.
 
-Time inside one control tick of 1/128 s is cut into four slots of 1/512 s, so that a measurement reaches the
-joints within one tick and no two blocks that feed each other run at the same instant:
+    class GreeterInputs(Inputs):
+        mode: ModeState                           # a message; an error when it is read and nothing is connected
+        estimate: RectangleEstimate = RectangleEstimate()     # reads as this value while nothing is connected
+        twist: Annotated[np.ndarray, 2]           # a vector of 2
+
+    class GreeterSystem(Block[GreeterInputs, Memory]):
+        OUTPUTS = {"status": Status}
+
+        def initial(self) -> Memory: ...
+        def step(self, time: float, inputs: GreeterInputs, memory: Memory) -> tuple[Memory, Outputs]: ...
+
+Time inside one control tick of 1/128 s is cut into four slots of 1/512 s, so that a measurement reaches the joints
+within one tick and no two blocks that feed each other run at the same instant:
 
     slot 0  robot_state (measurements are gathered)
     slot 1  behaviours
     slot 2  command_selector
     slot 3  supervisor, perception, and the station's wrench sensors, all for the next tick
 
-On a robot the commands leave at the beginning of slot 3: what takes longest, to look at an image and to plan where to
-stand (`later`), holds up none.
+Commands are published when slot 3 begins. Slow work (perception, and stance planning: `later`) therefore runs in
+slot 3 and cannot delay them.
 
 Every block uses UNRESTRICTED updates: a discrete update would see the plant already stepped.
 """
 
+import dataclasses as dc
 import functools
 import time as _time
-from collections.abc import Callable
-from typing import Any, ClassVar
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Generic, TypeVar, Union
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, InputPort, LeafSystem, State
 
+from valve_drake.messages import Message
+
 TICK = 1 / 128  # control period [s]
 SLOT = 1 / 512  # plant period, and the slots of a tick [s]
 
 Kind = type | int | AbstractValue  # a message class, the size of a vector, or a model value of one of Drake's types
+Outputs = dict[str, Any]  # port name -> what it holds from now on; ports left out keep their value
 
 
 class Profile:
@@ -38,130 +55,218 @@ class Profile:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self.beside = 0.0  # processor time of other processes that make images
-        self._stack: list[list] = []
+        self.render_worker_seconds = 0.0  # processor time of the processes that render images
+        self._stack: list[tuple[str, float]] = []  # kind, start
+        self._inner: list[float] = []  # seconds of the work inside each
 
     def clear(self) -> None:
         self.seconds.clear()
-        self.beside = 0.0
+        self.render_worker_seconds = 0.0
 
     def __call__(self, kind: str) -> "Profile":
-        self._stack.append([kind, _time.perf_counter(), 0.0])
+        self._stack.append((kind, _time.perf_counter()))
+        self._inner.append(0.0)
         return self
 
     def __enter__(self) -> None:
         pass
 
     def __exit__(self, *_: object) -> None:
-        kind, start, inner = self._stack.pop()
+        kind, start = self._stack.pop()
         spent = _time.perf_counter() - start
-        self.seconds[kind] = self.seconds.get(kind, 0.0) + spent - inner
-        if self._stack:
-            self._stack[-1][2] += spent
+        self.seconds[kind] = self.seconds.get(kind, 0.0) + spent - self._inner.pop()
+        if self._inner:
+            self._inner[-1] += spent
 
 
 profile = Profile()
 
+_REQUIRED = object()  # instead of a default: reading the port while nothing is connected is an error
+
+
+class _Port:
+    """One declared port as an attribute of Inputs: evaluated when it is read."""
+
+    def __init__(self, name: str, kind: Kind, default: Any):
+        self.name, self.kind, self.default = name, kind, default
+
+    def __get__(self, inputs: "Inputs | None", owner: type) -> Any:
+        return self if inputs is None else inputs.read(self.name, self.default)
+
+    def __set__(self, inputs: "Inputs", value: Any) -> None:
+        raise AttributeError(f"input port {self.name} can only be read")
+
 
 class Inputs:
-    """Read access to a block's input ports by name, evaluated on demand: a camera that a step does
-    not look at is not rendered. An unconnected port reads as None."""
+    """Read access to a block's input ports, evaluated on demand: a camera that a step does not look at is not rendered.
 
-    def __init__(self, block: "Block", context: Context):
+    A subclass annotates a block's ports, in order (see the top of this file); the annotation is the message class,
+    Annotated[np.ndarray, size], or Annotated[..., model value] for one of Drake's types. Ports of a table
+    (`Block.INPUTS`) are read as inputs["name"]. Unknown names: AttributeError, KeyError.
+    """
+
+    PORTS: ClassVar[dict[str, Kind]] = {}
+
+    def __init_subclass__(cls) -> None:
+        cls.PORTS = dict(cls.PORTS)
+        for name, hint in typing.get_type_hints(cls, include_extras=True).items():
+            if typing.get_origin(hint) is ClassVar or name in cls.PORTS:
+                continue
+            cls.PORTS[name] = kind = _kind(hint)
+            setattr(cls, name, _Port(name, kind, cls.__dict__.get(name, _REQUIRED)))
+
+    def __init__(self, block: "Block[Any, Any]", context: Context):
         self._block = block
         self._context = context
 
-    def __getattr__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> Any:
+        port = getattr(type(self), name, None)
+        return self.read(name, port.default if isinstance(port, _Port) else _REQUIRED)
+
+    def read(self, name: str, default: Any) -> Any:
+        """The value of a port, or `default` while nothing is connected to it.
+
+        Raises RuntimeError when nothing is connected and there is no default, TypeError for a wrong message.
+        """
         port, kind = self._block.input_ports[name]
         try:
             value = port.Eval(self._context)
-        except RuntimeError:  # also what Drake says of a port without a value; asking first would evaluate it twice
-            if port.HasValue(self._context):
+        except RuntimeError as error:
+            if port.HasValue(self._context):  # the error is the source's; asking before would evaluate it twice
                 raise
-            return None
+            if default is _REQUIRED:
+                raise RuntimeError(f"{port.GetFullDescription()}: nothing is connected") from error
+            return default
         if isinstance(kind, type) and not isinstance(value, kind):
             # Connect() cannot check this: Drake sees every Python message as Value[object].
             raise TypeError(f"{port.GetFullDescription()}: want {kind.__name__}, got {type(value).__name__}")
         return value
 
 
-class Block(LeafSystem):
-    """A stage on ports. Subclasses set INPUTS and OUTPUTS and write `step`.
+def _kind(hint: Any) -> Kind:
+    """The kind of port that an annotation asks for: `T` and `T | None` a message, Annotated[..., kind] that kind."""
+    if typing.get_origin(hint) is typing.Annotated:
+        kind: Kind = typing.get_args(hint)[1]
+        return kind
+    if typing.get_origin(hint) in (Union, types.UnionType):
+        (hint,) = (arg for arg in typing.get_args(hint) if arg is not type(None))
+    if not (isinstance(hint, type) and issubclass(hint, Message)):
+        raise TypeError(f"an input port is a message or Annotated[..., size], not {hint}")
+    return hint
 
-    INPUTS, OUTPUTS: port name -> message class, or vector size.
+
+I = TypeVar("I", bound=Inputs)  # noqa: E741 (inputs)
+M = TypeVar("M")  # memory
+
+
+class Block(LeafSystem, Generic[I, M]):
+    """A stage on ports. A subclass names its Inputs and its memory's type, sets OUTPUTS and writes `step`.
+
+    OUTPUTS: port name -> message class, or vector size. INPUTS: ports beside the annotated ones, for names that come
+    from a table.
     """
 
-    INPUTS: ClassVar[dict[str, Kind]] = {}
-    OUTPUTS: ClassVar[dict[str, Kind]] = {}
+    INPUTS: ClassVar[Mapping[str, Kind]] = {}
+    OUTPUTS: Mapping[str, Kind] = {}
+    _inputs: ClassVar[type[Inputs]] = Inputs
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for base in cls.__dict__.get("__orig_bases__", ()):
+            if typing.get_origin(base) is Block and isinstance(typing.get_args(base)[0], type):
+                cls._inputs = typing.get_args(base)[0]
 
     def __init__(self, name: str, *, period: float = TICK, slot: int = 1, delay: float = 0.0):
         """Runs every `period` seconds in slot `slot` of a tick, the first time `delay` seconds after 0."""
         super().__init__()
         self.set_name(name)
         self.input_ports: dict[str, tuple[InputPort, Kind]] = {}
-        for port, kind in self.INPUTS.items():
+        for port, kind in {**self._inputs.PORTS, **self.INPUTS}.items():
             if isinstance(kind, int):
                 declared = self.DeclareVectorInputPort(port, kind)
             else:
-                model = kind if isinstance(kind, AbstractValue) else Value(kind())
+                model = Value(kind()) if isinstance(kind, type) else kind
                 declared = self.DeclareAbstractInputPort(port, model)
             self.input_ports[port] = (declared, kind)
         self._memory = self.DeclareAbstractState(Value(_Held(self.initial())))
         self._held: dict[str, Any] = {}
-        vectors = {name: kind for name, kind in self.OUTPUTS.items() if isinstance(kind, int)}
         for port, kind in self.OUTPUTS.items():
-            if port in vectors:
+            if isinstance(kind, int):
                 index = self.DeclareDiscreteState(kind)
-            else:
+            elif isinstance(kind, type):
                 index = self.DeclareAbstractState(Value(kind()))
+            else:
+                raise TypeError(f"{name}.{port}: an output is a message class or the size of a vector")
             self._held[port] = index
             self.DeclareStateOutputPort(port, index)
         self.period = period
-        works = [(slot, self.step)]
+        works: list[tuple[int, Step]] = [(slot, self.step)]
         if type(self).later is not Block.later:
             works.append((3, self.later))
         for when, work in works:
             run = functools.partial(self._update, work)
             self.DeclarePeriodicUnrestrictedUpdateEvent(period, when * SLOT + delay, run)
 
-    def initial(self) -> Any:
-        """The memory before the first step: immutable, or None."""
-        return None
+    def initial(self) -> M:
+        """The memory before the first step; its arrays are locked. A block that keeps none need not write it."""
+        return None  # type: ignore[return-value]
 
-    def step(self, time: float, inputs: Inputs, memory: Any) -> tuple[Any, dict[str, Any]]:
+    def step(self, time: float, inputs: I, memory: M) -> tuple[M, Outputs]:
         """One step: new memory, and the outputs that change (those left out keep their value)."""
         raise NotImplementedError(f"{type(self).__name__}.step")  # abstract
 
-    def later(self, time: float, inputs: Inputs, memory: Any) -> tuple[Any, dict[str, Any]]:
-        """What of a step takes long and can wait for slot 3, when the commands have left; not run unless written."""
+    def later(self, time: float, inputs: I, memory: M) -> tuple[M, Outputs]:
+        """A second step in slot 3, for slow work that no command of this tick needs; runs only where it is written."""
         return memory, {}
 
-    def memory(self, context: Context) -> Any:
+    def memory(self, context: Context) -> M:
         """The memory in this Context, for tests and reports."""
-        return context.get_abstract_state(int(self._memory)).get_value().value
+        held: _Held = context.get_abstract_state(int(self._memory)).get_value()
+        memory: M = held.value
+        return memory
 
-    def _update(self, work: Callable, context: Context, state: State) -> None:
+    def _update(self, work: "Step", context: Context, state: State) -> None:
         with profile("stages"):
-            memory, outputs = work(context.get_time(), Inputs(self, context), self.memory(context))
+            memory, outputs = work(context.get_time(), self._inputs(self, context), self.memory(context))
         abstract = state.get_mutable_abstract_state()
         abstract.get_mutable_value(int(self._memory)).set_value(_Held(memory))
         for port, value in outputs.items():
             kind = self.OUTPUTS[port]
             if isinstance(kind, int):
                 state.get_mutable_discrete_state(int(self._held[port])).SetFromVector(np.asarray(value, float))
-            elif isinstance(value, kind):
+            elif isinstance(kind, type) and isinstance(value, kind):
                 abstract.get_mutable_value(int(self._held[port])).set_value(value)
             else:
-                raise TypeError(f"{self.get_name()}.{port}: want {kind.__name__}, got {type(value).__name__}")
+                raise TypeError(f"{self.get_name()}.{port}: want {kind}, got {type(value).__name__}")
+
+
+Step = Callable[[float, Any, Any], tuple[Any, Outputs]]
 
 
 class _Held:
-    """Carries a block's memory through Drake's state copies without copying it."""
+    """Carries a block's memory through Drake's state copies without copying it: its arrays are locked, so that no step
+    of one Context can change what a clone holds too."""
 
     __slots__ = ("value",)
 
     def __init__(self, value: Any):
+        lock(value)
         self.value = value
 
-    def __deepcopy__(self, memo: dict) -> "_Held":
+    def __deepcopy__(self, memo: dict[int, Any]) -> "_Held":
         return self
+
+
+def lock(value: Any) -> None:
+    """Makes every array in a memory read-only: in dataclasses, tuples, lists and dicts. Messages lock their own."""
+    if isinstance(value, np.ndarray):
+        value.setflags(write=False)
+    elif isinstance(value, tuple | list):
+        for part in value:
+            lock(part)
+    elif isinstance(value, dict):
+        for part in value.values():
+            lock(part)
+    elif dc.is_dataclass(value) and not isinstance(value, Message | type):
+        for part in vars(value).values():
+            lock(part)

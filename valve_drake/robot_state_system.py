@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 
 from valve_drake.messages import REMEMBERED, SIDES, RobotState
-from valve_drake.ports import TICK, Block, Inputs
+from valve_drake.ports import TICK, Block, Inputs, Outputs
 
 HISTORY = round(REMEMBERED / TICK)  # samples of the head's motion that are kept
 
 
-class RobotStateSystem(Block):
+class RobotStateSystem(Block[Inputs, np.ndarray]):
     """All measurement ports of the station in, `robot_state` out (slot 0 of every tick).
 
     The ports are those of stations/contract.py, same names. The message also carries the head's motion of the
@@ -41,12 +41,12 @@ class RobotStateSystem(Block):
     def initial(self) -> np.ndarray:
         return np.zeros((0, 7))
 
-    def step(self, time: float, inputs: Inputs, memory: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        read = {name: getattr(inputs, name) for name in self.INPUTS}
+    def step(self, time: float, inputs: Inputs, memory: np.ndarray) -> tuple[np.ndarray, Outputs]:
+        read = {name: inputs[name] for name in self.INPUTS}
         odometry, torso = read["base.odometry"], read["torso.position_measured"]
         row = np.concatenate([[time], odometry[:3], torso])
         history = np.vstack([memory[-(HISTORY - 1) :], row])
-        sides = {}
+        sides: dict[str, Any] = {}
         for side in SIDES:
             sides[f"{side}_arm"] = read[f"{side}_arm.position_measured"]
             sides[f"{side}_arm_velocity"] = read[f"{side}_arm.velocity_measured"]

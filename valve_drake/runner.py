@@ -184,7 +184,7 @@ def run(
     shares["physics"] = 1.0 - sum(shares.values())
     written = log if not writer.error else active(log)
     pace = pacer and pacer.report(mode.time)
-    return Result(summarize(written), wall, written, html, writer.error, shares, profile.beside, pace)
+    return Result(summarize(written), wall, written, html, writer.error, shares, profile.render_worker_seconds, pace)
 
 
 def _begin_log(writer: LogWriter, scenario: Scenario, files: Scenario, **facts: str) -> None:

@@ -1,35 +1,32 @@
-"""base_approach on ports. The mathematics: base_approach.py."""
-
-from typing import Any
+"""Block `base_approach`: stages 1 and 2 on ports. No mathematics here."""
 
 from valve_drake.behaviors.base_approach import BaseApproachConfig, Memory, step
 from valve_drake.messages import Command, ModeState, RectangleEstimate, RobotState, Stance, Status, StereoPosition
-from valve_drake.ports import TICK, Block, Inputs
-
-NO_POSITION, NO_ESTIMATE, NO_STANCE = StereoPosition(), RectangleEstimate(), Stance()
+from valve_drake.ports import TICK, Block, Inputs, Outputs
 
 
-class BaseApproachSystem(Block):
+class BaseApproachInputs(Inputs):
+    robot_state: RobotState
+    mode: ModeState
+    position: StereoPosition = StereoPosition()
+    estimate: RectangleEstimate = RectangleEstimate()
+    stance: Stance = Stance()
+
+
+class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
     """Driving to the valve and back; 1/64 s (wheels and neck need no more), slot 1.
 
-    | port | dir | type |
-    |---|---|---|
-    | robot_state | in | RobotState |
-    | mode | in | ModeState |
-    | position | in | StereoPosition (may be open) |
-    | estimate | in | RectangleEstimate (may be open) |
-    | stance | in | Stance of kinematic_approach (may be open) |
-    | command | out | Command: base_twist in its modes |
-    | status | out | Status |
+    port         dir  type               notes
+    -----------  ---  -----------------  ---------------------------------------
+    robot_state  in   RobotState
+    mode         in   ModeState
+    position     in   StereoPosition     stage 1
+    estimate     in   RectangleEstimate  stage 2
+    stance       in   Stance             where to stand, by kinematic_approach
+    command      out  Command            base_twist, in its modes
+    status       out  Status
     """
 
-    INPUTS = {
-        "robot_state": RobotState,
-        "mode": ModeState,
-        "position": StereoPosition,
-        "estimate": RectangleEstimate,
-        "stance": Stance,
-    }
     OUTPUTS = {"command": Command, "status": Status}
 
     def __init__(self, config: BaseApproachConfig, name: str = "base_approach"):
@@ -40,8 +37,7 @@ class BaseApproachSystem(Block):
     def initial(self) -> Memory:
         return Memory()
 
-    def step(self, time: float, inputs: Inputs, memory: Memory) -> tuple[Memory, dict[str, Any]]:
-        position, estimate, stance = inputs.position, inputs.estimate, inputs.stance
+    def step(self, time: float, inputs: BaseApproachInputs, memory: Memory) -> tuple[Memory, Outputs]:
         memory, command, status = step(
             self.config,
             memory,
@@ -49,8 +45,8 @@ class BaseApproachSystem(Block):
             self.period,
             inputs.robot_state,
             inputs.mode,
-            NO_POSITION if position is None else position,
-            NO_ESTIMATE if estimate is None else estimate,
-            NO_STANCE if stance is None else stance,
+            inputs.position,
+            inputs.estimate,
+            inputs.stance,
         )
         return memory, {"command": command, "status": status}

@@ -1,13 +1,17 @@
 """Block `hybrid_rotation`: stage 5 on ports. No mathematics here."""
 
-from typing import Any
-
 from valve_drake.behaviors.hybrid_rotation import HybridRotation, Memory
 from valve_drake.messages import Command, GraspPlan, ModeState, RobotState, Status, TurnState
-from valve_drake.ports import TICK, Block, Inputs
+from valve_drake.ports import TICK, Block, Inputs, Outputs
 
 
-class HybridRotationSystem(Block):
+class HybridRotationInputs(Inputs):
+    robot_state: RobotState
+    mode: ModeState
+    plan: GraspPlan
+
+
+class HybridRotationSystem(Block[HybridRotationInputs, Memory]):
     """Grasps, turns and releases the valve with both hands.
 
     port         dir  type        notes
@@ -20,7 +24,6 @@ class HybridRotationSystem(Block):
     turn         out  TurnState   telemetry: angle, couple, forces
     """
 
-    INPUTS = {"robot_state": RobotState, "mode": ModeState, "plan": GraspPlan}
     OUTPUTS = {"command": Command, "status": Status, "turn": TurnState}
 
     def __init__(self, law: HybridRotation, name: str = "hybrid_rotation"):
@@ -30,6 +33,6 @@ class HybridRotationSystem(Block):
     def initial(self) -> Memory:
         return Memory()
 
-    def step(self, time: float, inputs: Inputs, memory: Memory) -> tuple[Memory, dict[str, Any]]:
+    def step(self, time: float, inputs: HybridRotationInputs, memory: Memory) -> tuple[Memory, Outputs]:
         memory, command = self._law.step(time, TICK, memory, inputs.robot_state, inputs.mode, inputs.plan)
         return memory, {"command": command, "status": memory.status, "turn": memory.telemetry}

@@ -1,13 +1,17 @@
 """Block `image_servo`: stage 4 on ports. No mathematics here."""
 
-from typing import Any
-
 from valve_drake.behaviors.image_servo import ImageServo, Memory
 from valve_drake.messages import Command, HandleMarks, ModeState, RobotState, ServoState, Status
-from valve_drake.ports import TICK, Block, Inputs
+from valve_drake.ports import TICK, Block, Inputs, Outputs
 
 
-class ImageServoSystem(Block):
+class ImageServoInputs(Inputs):
+    robot_state: RobotState
+    mode: ModeState
+    marks: HandleMarks
+
+
+class ImageServoSystem(Block[ImageServoInputs, Memory]):
     """Servos both hands onto the taught images of their green marks.
 
     port         dir  type         notes
@@ -20,7 +24,6 @@ class ImageServoSystem(Block):
     servo        out  ServoState   telemetry
     """
 
-    INPUTS = {"robot_state": RobotState, "mode": ModeState, "marks": HandleMarks}
     OUTPUTS = {"command": Command, "status": Status, "servo": ServoState}
 
     def __init__(self, law: ImageServo, name: str = "image_servo"):
@@ -30,6 +33,6 @@ class ImageServoSystem(Block):
     def initial(self) -> Memory:
         return Memory()
 
-    def step(self, time: float, inputs: Inputs, memory: Memory) -> tuple[Memory, dict[str, Any]]:
+    def step(self, time: float, inputs: ImageServoInputs, memory: Memory) -> tuple[Memory, Outputs]:
         memory, command, servo = self._law.step(time, TICK, memory, inputs.robot_state, inputs.mode, inputs.marks)
         return memory, {"command": command, "status": memory.status, "servo": servo}

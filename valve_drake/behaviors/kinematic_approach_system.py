@@ -1,7 +1,5 @@
 """Block `kinematic_approach`: stage 3 on ports. No mathematics here."""
 
-from typing import Any
-
 from valve_drake.behaviors.kinematic_approach import KinematicApproach, Memory
 from valve_drake.messages import (
     Command,
@@ -14,10 +12,18 @@ from valve_drake.messages import (
     Status,
     TurnState,
 )
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import Block, Inputs, Outputs
 
 
-class KinematicApproachSystem(Block):
+class KinematicApproachInputs(Inputs):
+    robot_state: RobotState
+    mode: ModeState
+    estimate: RectangleEstimate
+    marks: HandleMarks
+    turn: TurnState
+
+
+class KinematicApproachSystem(Block[KinematicApproachInputs, Memory]):
     """Arms by forward and inverse kinematics, and the looks at rest before and after the turn.
 
     port         dir  type               notes
@@ -33,13 +39,6 @@ class KinematicApproachSystem(Block):
     plan         out  GraspPlan          the valve and the grasps in B, measured at rest
     """
 
-    INPUTS = {
-        "robot_state": RobotState,
-        "mode": ModeState,
-        "estimate": RectangleEstimate,
-        "marks": HandleMarks,
-        "turn": TurnState,
-    }
     OUTPUTS = {"command": Command, "status": Status, "stance": Stance, "plan": GraspPlan}
 
     def __init__(self, law: KinematicApproach, name: str = "kinematic_approach"):
@@ -49,7 +48,7 @@ class KinematicApproachSystem(Block):
     def initial(self) -> Memory:
         return Memory()
 
-    def step(self, time: float, inputs: Inputs, memory: Memory) -> tuple[Memory, dict[str, Any]]:
+    def step(self, time: float, inputs: KinematicApproachInputs, memory: Memory) -> tuple[Memory, Outputs]:
         memory, command = self._law.step(
             time, memory, inputs.robot_state, inputs.mode, inputs.estimate, inputs.marks, inputs.turn
         )
@@ -60,6 +59,6 @@ class KinematicApproachSystem(Block):
             "plan": memory.plan,
         }
 
-    def later(self, time: float, inputs: Inputs, memory: Memory) -> tuple[Memory, dict[str, Any]]:
+    def later(self, time: float, inputs: KinematicApproachInputs, memory: Memory) -> tuple[Memory, Outputs]:
         memory = self._law.watch_stance(time, memory, inputs.mode, inputs.estimate)
         return memory, {"stance": memory.stance}

@@ -1,19 +1,10 @@
-"""color_segmentation on ports.
-
-| port | direction | type |
-|---|---|---|
-| head_left_image | in | CameraFrame |
-| head_right_image | in | CameraFrame |
-| mode | in | ModeState |
-| segmentation | out | SegmentationPair |
-"""
+"""Block `color_segmentation`: segmenting both head images on ports. No mathematics here."""
 
 import dataclasses as dc
-from typing import Any
 
 from valve_drake.messages import CameraFrame, MarkerCandidate, Mode, ModeState, Segmentation, SegmentationPair
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import Block, Inputs, Outputs
 
 _Box = tuple[int, int, int, int]
 
@@ -26,10 +17,23 @@ class _Memory:
     boxes: tuple[_Box | None, _Box | None] = (None, None)  # where the candidates were, in each image
 
 
-class ColorSegmentationSystem(Block):
-    """Looks at both head images of one capture time, as often as the mode asks (config.every); else holds."""
+class ColorSegmentationInputs(Inputs):
+    head_left_image: CameraFrame = CameraFrame()
+    head_right_image: CameraFrame = CameraFrame()
+    mode: ModeState
 
-    INPUTS = {"head_left_image": CameraFrame, "head_right_image": CameraFrame, "mode": ModeState}
+
+class ColorSegmentationSystem(Block[ColorSegmentationInputs, _Memory]):
+    """Looks at both head images of one capture time, as often as the mode asks (config.every); else holds.
+
+    port              dir  type              notes
+    ----------------  ---  ----------------  -----------------
+    head_left_image   in   CameraFrame
+    head_right_image  in   CameraFrame
+    mode              in   ModeState         how often to look
+    segmentation      out  SegmentationPair
+    """
+
     OUTPUTS = {"segmentation": SegmentationPair}
 
     def __init__(
@@ -46,14 +50,14 @@ class ColorSegmentationSystem(Block):
     def initial(self) -> _Memory:
         return _Memory()
 
-    def step(self, time: float, inputs: Inputs, memory: _Memory) -> tuple[_Memory, dict[str, Any]]:
+    def step(self, time: float, inputs: ColorSegmentationInputs, memory: _Memory) -> tuple[_Memory, Outputs]:
         state = inputs.mode
-        every = self._config.every.get(state.mode, 0) if state is not None else 0
+        every = self._config.every.get(state.mode, 0)
         memory = dc.replace(memory, idle=memory.idle + 1)
         if every == 0 or memory.idle < every:
             return memory, {}
         left, right = inputs.head_left_image, inputs.head_right_image
-        if left is None or right is None or left.sequence < 0 or right.sequence < 0 or left.time != right.time:
+        if left.sequence < 0 or right.sequence < 0 or left.time != right.time:
             return memory, {}
         if left.sequence == memory.sequence:
             return memory, {}

@@ -1,19 +1,10 @@
-"""handle_marker on ports.
-
-| port | direction | type |
-|---|---|---|
-| left_wrist_image | in | CameraFrame |
-| right_wrist_image | in | CameraFrame |
-| mode | in | ModeState |
-| marks | out | HandleMarks |
-"""
+"""Block `handle_marker`: the green marks in the wrist images on ports. No mathematics here."""
 
 import dataclasses as dc
-from typing import Any
 
 from valve_drake.messages import CameraFrame, HandleMark, HandleMarks, ModeState
 from valve_drake.perception.handle_marker import HandleMarkerConfig, find_mark
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import Block, Inputs, Outputs
 
 
 @dc.dataclass(frozen=True)
@@ -23,10 +14,23 @@ class _Memory:
     right: HandleMark = dc.field(default_factory=HandleMark)
 
 
-class HandleMarkerSystem(Block):
-    """Looks at both wrist images as often as the mode asks (config.every); else holds."""
+class HandleMarkerInputs(Inputs):
+    left_wrist_image: CameraFrame = CameraFrame()
+    right_wrist_image: CameraFrame = CameraFrame()
+    mode: ModeState
 
-    INPUTS = {"left_wrist_image": CameraFrame, "right_wrist_image": CameraFrame, "mode": ModeState}
+
+class HandleMarkerSystem(Block[HandleMarkerInputs, _Memory]):
+    """Looks at both wrist images as often as the mode asks (config.every); else holds.
+
+    port               dir  type         notes
+    -----------------  ---  -----------  -----------------
+    left_wrist_image   in   CameraFrame
+    right_wrist_image  in   CameraFrame
+    mode               in   ModeState    how often to look
+    marks              out  HandleMarks
+    """
+
     OUTPUTS = {"marks": HandleMarks}
 
     def __init__(
@@ -43,9 +47,9 @@ class HandleMarkerSystem(Block):
     def initial(self) -> _Memory:
         return _Memory()
 
-    def step(self, time: float, inputs: Inputs, memory: _Memory) -> tuple[_Memory, dict[str, Any]]:
+    def step(self, time: float, inputs: HandleMarkerInputs, memory: _Memory) -> tuple[_Memory, Outputs]:
         state = inputs.mode
-        every = self._config.every.get(state.mode, 0) if state is not None else 0
+        every = self._config.every.get(state.mode, 0)
         memory = dc.replace(memory, idle=memory.idle + 1)
         if every == 0 or memory.idle < every:
             return memory, {}
@@ -56,9 +60,9 @@ class HandleMarkerSystem(Block):
         marks = HandleMarks(time=max(left.time, right.time), left=left, right=right)
         return _Memory(idle=0, left=left, right=right), {"marks": marks}
 
-    def _look(self, frame: CameraFrame | None, last: HandleMark) -> HandleMark:
+    def _look(self, frame: CameraFrame, last: HandleMark) -> HandleMark:
         """The mark in a new frame; `last` if the frame is not new."""
-        if frame is None or frame.sequence < 0 or frame.sequence == last.sequence:
+        if frame.sequence < 0 or frame.sequence == last.sequence:
             return last
         mark = find_mark(frame.image, self._config)
         return dc.replace(mark, frame=frame, time=frame.time, sequence=frame.sequence)

@@ -1,25 +1,26 @@
-"""line_fitting on ports.
-
-| port | direction | type |
-|---|---|---|
-| segmentation | in | SegmentationPair |
-| edges | out | MarkerEdges: of the pair of candidates that fits the marker best |
-"""
-
-from typing import Any
+"""Block `line_fitting`: the marker's sub-pixel edges on ports. No mathematics here."""
 
 from valve_drake.camera.lens import StereoHead
 from valve_drake.messages import MarkerEdges, SegmentationPair
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import Block, Inputs, Outputs
 
 
-class LineFittingSystem(Block):
-    """Fits the sides of the marker in every new pair of segmented images. Memory: the last sequence."""
+class LineFittingInputs(Inputs):
+    segmentation: SegmentationPair = SegmentationPair()
 
-    INPUTS = {"segmentation": SegmentationPair}
+
+class LineFittingSystem(Block[LineFittingInputs, int]):
+    """Fits the sides of the marker in every new pair of segmented images. Memory: the last sequence.
+
+    port          dir  type              notes
+    ------------  ---  ----------------  ---------------------------------------------------
+    segmentation  in   SegmentationPair
+    edges         out  MarkerEdges       of the pair of candidates that fits the marker best
+    """
+
     OUTPUTS = {"edges": MarkerEdges}
 
     def __init__(
@@ -42,9 +43,9 @@ class LineFittingSystem(Block):
     def initial(self) -> int:
         return -1
 
-    def step(self, time: float, inputs: Inputs, memory: int) -> tuple[int, dict[str, Any]]:
+    def step(self, time: float, inputs: LineFittingInputs, memory: int) -> tuple[int, Outputs]:
         pair = inputs.segmentation
-        if pair is None or pair.sequence == memory:
+        if pair.sequence == memory:
             return memory, {}
         edges = fit_pair(pair, self._head, self._marker, self._config, self._matching)
         return pair.sequence, {"edges": edges}

@@ -1,16 +1,7 @@
-"""rectangle_estimator on ports.
-
-| port | direction | type |
-|---|---|---|
-| edges | in | MarkerEdges |
-| robot_state | in | RobotState |
-| mode | in | ModeState |
-| estimate | out | RectangleEstimate |
-"""
+"""Block `rectangle_estimator`: stage 2 on ports. No mathematics here."""
 
 import dataclasses as dc
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +10,7 @@ from valve_drake.camera.lens import StereoHead
 from valve_drake.messages import MarkerEdges, Mode, ModeState, RectangleEstimate, RobotState
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import Block, Inputs, Outputs
 
 
 @dc.dataclass(frozen=True)
@@ -31,13 +22,25 @@ class _Memory:
     axis_known: bool = False
 
 
-class RectangleEstimatorSystem(Block):
+class RectangleEstimatorInputs(Inputs):
+    edges: MarkerEdges = MarkerEdges()
+    robot_state: RobotState
+    mode: ModeState
+
+
+class RectangleEstimatorSystem(Block[RectangleEstimatorInputs, _Memory]):
     """Estimates the marker's pose from every new pair of edges; follows its X axis from frame to frame.
+
+    port         dir  type               notes
+    -----------  ---  -----------------  ------------------------------
+    edges        in   MarkerEdges
+    robot_state  in   RobotState         where the head was
+    mode         in   ModeState          a new search forgets the track
+    estimate     out  RectangleEstimate
 
     head_pose: base (x, y, heading) in O and torso angles -> X_OL (3, 4).
     """
 
-    INPUTS = {"edges": MarkerEdges, "robot_state": RobotState, "mode": ModeState}
     OUTPUTS = {"estimate": RectangleEstimate}
 
     def __init__(
@@ -59,12 +62,12 @@ class RectangleEstimatorSystem(Block):
     def initial(self) -> _Memory:
         return _Memory()
 
-    def step(self, time: float, inputs: Inputs, memory: _Memory) -> tuple[_Memory, dict[str, Any]]:
+    def step(self, time: float, inputs: RectangleEstimatorInputs, memory: _Memory) -> tuple[_Memory, Outputs]:
         state = inputs.mode
-        if state is not None and state.mode == Mode.SEARCH and state.activation != memory.search:
+        if state.mode == Mode.SEARCH and state.activation != memory.search:
             memory = _Memory(sequence=memory.sequence, search=state.activation)
         edges = inputs.edges
-        if edges is None or edges.sequence == memory.sequence:
+        if edges.sequence == memory.sequence:
             return memory, {}
         X_OL = self._head_pose(*inputs.robot_state.head_at(edges.time))
         track = None

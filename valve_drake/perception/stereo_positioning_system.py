@@ -1,14 +1,6 @@
-"""stereo_positioning on ports.
-
-| port | direction | type |
-|---|---|---|
-| segmentation | in | SegmentationPair |
-| robot_state | in | RobotState |
-| position | out | StereoPosition |
-"""
+"""Block `stereo_positioning`: stage 1 on ports. No mathematics here."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -16,16 +8,26 @@ from valve_drake.camera.lens import StereoHead
 from valve_drake.messages import RobotState, SegmentationPair, StereoPosition
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig, locate
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import Block, Inputs, Outputs
 
 
-class StereoPositioningSystem(Block):
+class StereoPositioningInputs(Inputs):
+    segmentation: SegmentationPair = SegmentationPair()
+    robot_state: RobotState
+
+
+class StereoPositioningSystem(Block[StereoPositioningInputs, int]):
     """Triangulates the marker's centre in every new pair of segmented images. Memory: the last sequence.
+
+    port          dir  type              notes
+    ------------  ---  ----------------  ------------------
+    segmentation  in   SegmentationPair
+    robot_state   in   RobotState        where the head was
+    position      out  StereoPosition
 
     head_pose: base (x, y, heading) in O and torso angles -> X_OL (3, 4).
     """
 
-    INPUTS = {"segmentation": SegmentationPair, "robot_state": RobotState}
     OUTPUTS = {"position": StereoPosition}
 
     def __init__(
@@ -47,9 +49,9 @@ class StereoPositioningSystem(Block):
     def initial(self) -> int:
         return -1
 
-    def step(self, time: float, inputs: Inputs, memory: int) -> tuple[int, dict[str, Any]]:
+    def step(self, time: float, inputs: StereoPositioningInputs, memory: int) -> tuple[int, Outputs]:
         pair = inputs.segmentation
-        if pair is None or pair.sequence == memory:
+        if pair.sequence == memory:
             return memory, {}
         X_OL = self._head_pose(*inputs.robot_state.head_at(pair.time))
         return pair.sequence, {"position": locate(pair, self._head, self._marker, self._config, X_OL)}

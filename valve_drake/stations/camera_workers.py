@@ -107,7 +107,7 @@ class CameraWorkers:
     def _receive(self, name: str) -> None:
         with self._wire(name) as wire:
             frame, seconds = _recv(wire)
-        profile.beside += seconds
+        profile.render_worker_seconds += seconds
         self._made[frame.camera, frame.sequence] = frame
 
     def _worker(self, name: str) -> _Worker:

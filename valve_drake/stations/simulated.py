@@ -7,6 +7,7 @@ of the robot alone. `truth.*` ports exist here only; the recorder alone reads th
 
 import dataclasses as dc
 import math
+from typing import Annotated
 
 import numpy as np
 from pydrake.common.value import Value
@@ -20,7 +21,7 @@ from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, Multipl
 from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
 from valve_drake.messages import SIDES, Health
-from valve_drake.ports import SLOT, TICK, Block, Inputs
+from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, CONTRACT, TRUTH, check_contract
@@ -138,7 +139,11 @@ class _Noise:
         return self._rows[count % len(self._rows)]
 
 
-class OdometrySystem(Block):
+class OdometryInputs(Inputs):
+    base: Annotated[np.ndarray, 6]
+
+
+class OdometrySystem(Block[OdometryInputs, tuple[np.ndarray, int]]):
     """Wheel odometry: starts at zero, integrates measured wheel speeds, drifts.
 
     port      dir  type       unit                notes
@@ -147,7 +152,6 @@ class OdometrySystem(Block):
     odometry  out  vector(5)  m, rad, m/s, rad/s  x, y, heading, forward, yaw rate
     """
 
-    INPUTS = {"base": 6}
     OUTPUTS = {"odometry": 5}
 
     def __init__(self, error: ErrorConfig, seed: int):
@@ -159,7 +163,9 @@ class OdometrySystem(Block):
     def initial(self) -> tuple[np.ndarray, int]:
         return np.zeros(5), 0
 
-    def step(self, time: float, inputs: Inputs, memory: tuple[np.ndarray, int]) -> tuple:
+    def step(
+        self, time: float, inputs: OdometryInputs, memory: tuple[np.ndarray, int]
+    ) -> tuple[tuple[np.ndarray, int], Outputs]:
         (x, y, h, _, _), count = memory
         _, _, heading, vx, vy, w = inputs.base
         forward = vx * np.cos(heading) + vy * np.sin(heading)
@@ -172,7 +178,11 @@ class OdometrySystem(Block):
         return (new, count + 1), {"odometry": new}
 
 
-class WrenchSensorSystem(Block):
+class WrenchSensorInputs(Inputs):
+    reaction_forces: Annotated[list[SpatialForce], Value[list[SpatialForce]]()]
+
+
+class WrenchSensorSystem(Block[WrenchSensorInputs, int]):
     """Both wrist force-torque sensors: load felt by the sensor, in its frame, with bias and noise.
 
     port             dir  type                notes
@@ -181,7 +191,6 @@ class WrenchSensorSystem(Block):
     left, right      out  vector(6)           [torque; force] [N m, N]
     """
 
-    INPUTS = {"reaction_forces": Value[list[SpatialForce]]()}
     OUTPUTS = {side: 6 for side in SIDES}
 
     def __init__(self, joints: dict[str, int], error: ErrorConfig, seed: int):
@@ -197,7 +206,7 @@ class WrenchSensorSystem(Block):
     def initial(self) -> int:
         return 0
 
-    def step(self, time: float, inputs: Inputs, memory: int) -> tuple[int, dict]:
+    def step(self, time: float, inputs: WrenchSensorInputs, memory: int) -> tuple[int, Outputs]:
         forces = inputs.reaction_forces
         draw = self._noise(memory).reshape(2, 6)
         out = {}
@@ -208,7 +217,7 @@ class WrenchSensorSystem(Block):
         return memory + 1, out
 
 
-class HealthSystem(Block):
+class HealthSystem(Block[Inputs, None]):
     """The simulated machine reports that all its devices speak."""
 
     OUTPUTS = {"health": Health}
@@ -217,7 +226,7 @@ class HealthSystem(Block):
     def __init__(self) -> None:
         super().__init__("health", period=1 / 32, slot=0)
 
-    def step(self, time: float, inputs: Inputs, memory: None) -> tuple[None, dict]:
+    def step(self, time: float, inputs: Inputs, memory: None) -> tuple[None, Outputs]:
         return None, {"health": Health(time=time, devices=self.DEVICES, ages=np.zeros(len(self.DEVICES)))}
 
 

@@ -1,13 +1,12 @@
-"""command_selector on ports. The mathematics: command_selector.py."""
+"""Block `command_selector`: arbitration and limits on ports. No mathematics here."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, State
 
 from valve_drake.messages import Command, Health, ModeState, RobotState, SelectorReport
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import Block, Inputs, Outputs
 from valve_drake.supervisor.command_selector import (
     BEHAVIORS,
     PORTS,
@@ -19,26 +18,36 @@ from valve_drake.supervisor.command_selector import (
 )
 
 
-class CommandSelectorSystem(Block):
+class CommandSelectorInputs(Inputs):
+    mode: ModeState
+    robot_state: RobotState
+    health: Health
+    valve_search: Command | None = None
+    base_approach: Command | None = None
+    kinematic_approach: Command | None = None
+    image_servo: Command | None = None
+    hybrid_rotation: Command | None = None
+
+
+class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
     """The only writer to the robot; 1/128 s, slot 2.
 
-    | port | dir | type |
-    |---|---|---|
-    | mode | in | ModeState |
-    | robot_state | in | RobotState |
-    | health | in | Health |
-    | valve_search, base_approach, kinematic_approach, image_servo, hybrid_rotation | in | Command (may be open) |
-    | base.twist_command | out | 2: forward [m/s], yaw rate [rad/s] |
-    | torso.position_command | out | 3 [rad] |
-    | left_arm.position_command, right_arm.position_command | out | 6 [rad] |
-    | left_gripper.position_command, right_gripper.position_command | out | 1: opening [m] |
-    | left_gripper.force_limit, right_gripper.force_limit | out | 1 [N] |
-    | report | out | SelectorReport |
+    port                             dir  type            notes
+    -------------------------------  ---  --------------  --------------------------------
+    mode                             in   ModeState
+    robot_state                      in   RobotState
+    health                           in   Health          of the station
+    (every behaviour)                in   Command         one port each, named after it
+    base.twist_command               out  vector(2)       forward [m/s], yaw rate [rad/s]
+    torso.position_command           out  vector(3)       [rad]
+    {side}_arm.position_command      out  vector(6)       [rad]
+    {side}_gripper.position_command  out  vector(1)       opening [m]
+    {side}_gripper.force_limit       out  vector(1)       [N]
+    report                           out  SelectorReport
 
     initial: what the output vectors hold until the first robot state, by port name.
     """
 
-    INPUTS = {"mode": ModeState, "robot_state": RobotState, "health": Health} | dict.fromkeys(BEHAVIORS, Command)
     OUTPUTS = PORTS | {"report": SelectorReport}
 
     def __init__(
@@ -58,8 +67,8 @@ class CommandSelectorSystem(Block):
         for port, value in outputs(self.memory(context)).items():
             state.get_mutable_discrete_state(int(self._held[port])).SetFromVector(value)
 
-    def step(self, time: float, inputs: Inputs, memory: Memory) -> tuple[Memory, dict[str, Any]]:
-        commands = {name: getattr(inputs, name) for name in BEHAVIORS}
+    def step(self, time: float, inputs: CommandSelectorInputs, memory: Memory) -> tuple[Memory, Outputs]:
+        commands = {name: inputs[name] for name in BEHAVIORS}
         memory, report = step(
             self.config, memory, time, self.period, inputs.mode, inputs.robot_state, inputs.health, commands
         )

@@ -1,27 +1,33 @@
-"""supervisor on ports. The mathematics: supervisor.py."""
-
-from typing import Any
+"""Block `supervisor`: the transitions on ports. No mathematics here."""
 
 from valve_drake.messages import Health, ModeState, OperatorCommand, SelectorReport, Status
-from valve_drake.ports import Block, Inputs
+from valve_drake.ports import Block, Inputs, Outputs
 from valve_drake.supervisor.supervisor import BEHAVIORS, State, SupervisorConfig, step
 
 
-class SupervisorSystem(Block):
+class SupervisorInputs(Inputs):
+    operator: OperatorCommand = OperatorCommand()
+    health: Health | None = None  # a station that reports nothing is a fault
+    selector: SelectorReport = SelectorReport()
+    valve_search: Status = Status()
+    base_approach: Status = Status()
+    kinematic_approach: Status = Status()
+    image_servo: Status = Status()
+    hybrid_rotation: Status = Status()
+
+
+class SupervisorSystem(Block[SupervisorInputs, State]):
     """Changes the mode, and nobody else does; 1/32 s, slot 3.
 
-    | port | dir | type |
-    |---|---|---|
-    | operator | in | OperatorCommand (may be open) |
-    | health | in | Health (open counts as a fault) |
-    | selector | in | SelectorReport (may be open) |
-    | valve_search, base_approach, kinematic_approach, image_servo, hybrid_rotation | in | Status (may be open) |
-    | mode | out | ModeState |
+    port                dir  type             notes
+    ------------------  ---  ---------------  ---------------------------------
+    operator            in   OperatorCommand
+    health              in   Health           of the station; open: a fault
+    selector            in   SelectorReport
+    (every behaviour)   in   Status           one port each, named after it
+    mode                out  ModeState
     """
 
-    INPUTS = {"operator": OperatorCommand, "health": Health, "selector": SelectorReport} | dict.fromkeys(
-        BEHAVIORS, Status
-    )
     OUTPUTS = {"mode": ModeState}
 
     def __init__(self, config: SupervisorConfig, name: str = "supervisor"):
@@ -32,7 +38,7 @@ class SupervisorSystem(Block):
     def initial(self) -> State:
         return State()
 
-    def step(self, time: float, inputs: Inputs, memory: State) -> tuple[State, dict[str, Any]]:
-        statuses = {name: getattr(inputs, name) for name in BEHAVIORS}
+    def step(self, time: float, inputs: SupervisorInputs, memory: State) -> tuple[State, Outputs]:
+        statuses = {name: inputs[name] for name in BEHAVIORS}
         state = step(self.config, memory, time, statuses, inputs.health, inputs.operator, inputs.selector)
         return state, {"mode": state.message(time)}
