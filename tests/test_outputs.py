@@ -9,7 +9,7 @@ import stat
 import pytest
 
 from valve_drake import outputs
-from valve_drake.checks import ConfigError, OperationFailed
+from valve_drake.checks import ConfigError, OperationFailed, shown
 
 
 def refused(words, path, option="--out", **options):
@@ -17,7 +17,7 @@ def refused(words, path, option="--out", **options):
         outputs.check(path, option, **options)
     line = str(caught.value)
     assert line.startswith(f"{option} must be ") and words in line and "\n" not in line
-    assert line.endswith(f"got {os.fspath(path)!r}")
+    assert line.endswith(f"got {shown(path)}")
 
 
 def test_a_new_name_is_taken_as_it_is_and_nothing_is_created(tmp_path):
@@ -153,13 +153,21 @@ def test_a_folder_that_went_away_is_one_line(tmp_path):
 
 
 def test_a_folder_may_be_new_but_no_file_and_no_link_to_nowhere(tmp_path):
-    assert outputs.check_folder(tmp_path / "new", "--out", ["a"]) == tmp_path / "new"
+    for name in ("new", "new/deep"):
+        assert outputs.check_folder(tmp_path / name, "--out", ["a"]) == tmp_path / name
     assert not (tmp_path / "new").exists()
     (tmp_path / "file").touch()
     (tmp_path / "dangling").symlink_to("nowhere")
-    for name in ("file", "file/below", "no/such", "dangling"):
+    for name in ("file", "file/below", "dangling"):
         with pytest.raises(ConfigError, match=r"^--out must be "):
-            outputs.check_folder(tmp_path / name, "--out")
-    os.mkfifo(tmp_path / "a")
+            outputs.check_folder(tmp_path / name, "--out", ["a"])
+
+
+def test_the_files_in_a_folder_are_checked_like_any_other(tmp_path):
+    (tmp_path / "a").write_text("mine")
+    with pytest.raises(ConfigError, match="does not exist yet, got '.*/a'"):
+        outputs.check_folder(tmp_path, "--out", ["b", "a"])
+    assert outputs.check_folder(tmp_path, "--out", ["b", "a"], made_before=lambda path: path.name == "a") == tmp_path
+    os.mkfifo(tmp_path / "b")
     with pytest.raises(ConfigError, match="regular file"):
-        outputs.check_folder(tmp_path, "--out", ["a"])
+        outputs.check_folder(tmp_path, "--out", ["a", "b"], made_before=lambda path: True)

@@ -158,9 +158,17 @@ def test_sigterm_completes_the_log(tmp_path):
     assert log.damage == [] and log.end >= now
 
 
+def on_a_full_disk(path: Path) -> LogWriter:
+    """A log whose file takes nothing any more."""
+    log = LogWriter(path)
+    full = os.open("/dev/full", os.O_WRONLY)
+    os.dup2(full, log._file.file.fileno())
+    os.close(full)
+    return log
+
+
 def test_a_full_disk_stops_the_log_and_not_the_loop(tmp_path, caplog):
-    os.symlink("/dev/full", tmp_path / "a.mcap.active")
-    log = LogWriter(tmp_path / "a.mcap")
+    log = on_a_full_disk(tmp_path / "a.mcap")
     with caplog.at_level(logging.ERROR):
         for topic, message, t in samples(20.0, 1000):
             log.write(topic, message, t)
@@ -178,8 +186,7 @@ def test_a_full_disk_stops_the_log_and_not_the_loop(tmp_path, caplog):
 
 
 def test_the_runs_own_error_is_not_hidden_by_the_logs(tmp_path):
-    os.symlink("/dev/full", tmp_path / "a.mcap.active")
-    with pytest.raises(ZeroDivisionError), LogWriter(tmp_path / "a.mcap") as log:
+    with pytest.raises(ZeroDivisionError), on_a_full_disk(tmp_path / "a.mcap") as log:
         log.write("/a", Status(), 0.0)
         raise ZeroDivisionError
 

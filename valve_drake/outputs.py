@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, TypeAlias
 
-from valve_drake.checks import ConfigError, OperationFailed
+from valve_drake.checks import ConfigError, OperationFailed, shown
 
 PathLike: TypeAlias = str | os.PathLike[str]
 
@@ -24,6 +24,7 @@ def check(
     inputs: Iterable[PathLike] = (),
     made_before: Callable[[Path], bool] | None = None,
     overwrite: bool | None = None,
+    new_folders: bool = False,
 ) -> Path:
     """The file to write for `path`, links followed. Nothing is created or changed.
 
@@ -31,39 +32,39 @@ def check(
     what the command reads (and the unfinished FILE.active of it), and what else it writes.
     made_before: says whether an existing file is a product of the same kind, which may be replaced.
     overwrite: whether any existing file may be replaced; None where a command has no --overwrite.
+    new_folders: the folder may not exist yet; the caller makes it.
     Raises ConfigError, one line, for a path that must not or cannot be written.
     """
-    target, existing = _target(path, option)
+    target, existing = _target(path, option, new_folders)
     for other in inputs:
         for name in (Path(other), Path(f"{os.fspath(other)}.active")):
             if _same(target, name):
-                raise _refusal(option, f"another file than {str(name)!r}", path)
+                raise _refusal(option, f"another file than {shown(name)}", path)
     if existing is not None and not overwrite and not (made_before is not None and made_before(target)):
         hint = "" if overwrite is None else " (--overwrite replaces it)"
         raise _refusal(option, "a file that does not exist yet" + hint, path)
-    if not os.access(target.parent, os.W_OK | os.X_OK):
+    folder = target.parent
+    while new_folders and not os.path.lexists(folder):
+        folder = folder.parent
+    if not os.access(folder, os.W_OK | os.X_OK):
         raise _refusal(option, "in a folder that can be written", path)
     return target
 
 
-def check_folder(path: PathLike, option: str, names: Iterable[str] = ()) -> Path:
-    """A folder to put the files `names` into; it may not exist yet, if the one above it does. Nothing is created.
+def check_folder(
+    path: PathLike,
+    option: str,
+    names: Iterable[str],
+    inputs: Iterable[PathLike] = (),
+    made_before: Callable[[Path], bool] | None = None,
+) -> Path:
+    """A folder to put the files `names` into; it may not exist yet. Nothing is created.
 
-    Existing files of these names are replaced, unless they are no regular files. Raises ConfigError, one line.
+    Each of the files is checked as `check` does. Raises ConfigError, one line.
     """
-    folder = Path(path)
-    mode = _mode(folder, option, path)
-    if mode is None:
-        parent = _mode(folder.parent, option, path)
-        if parent is None or not stat.S_ISDIR(parent) or os.path.lexists(folder):
-            raise _refusal(option, "a folder, or a new one in a folder that exists", path)
-        if not os.access(folder.parent, os.W_OK | os.X_OK):
-            raise _refusal(option, "in a folder that can be written", path)
-        return folder
-    if not stat.S_ISDIR(mode):
-        raise _refusal(option, "a folder", path)
+    folder, inputs = Path(path), tuple(inputs)
     for name in names:
-        check(folder / name, option, overwrite=True)
+        check(folder / name, option, inputs, made_before, new_folders=True)
     return folder
 
 
@@ -105,15 +106,18 @@ def replacing(path: PathLike) -> Iterator[IO[bytes]]:
         raise OperationFailed(f"{str(path)!r} cannot be written: {error.strerror or error}") from error
 
 
-def _target(path: PathLike, option: str) -> tuple[Path, os.stat_result | None]:
+def _target(path: PathLike, option: str, new_folders: bool = False) -> tuple[Path, os.stat_result | None]:
     """The file behind `path`, and its status if it exists. Raises ConfigError unless it is or can be a regular file."""
     target = Path(path)
     if os.path.islink(target):
         target = Path(os.path.realpath(target))
     if target.name in ("", ".."):
         raise _refusal(option, "the name of a file", path)
-    parent = _mode(target.parent, option, path)
-    if parent is None or not stat.S_ISDIR(parent):
+    folder = target.parent
+    while new_folders and not os.path.lexists(folder):
+        folder = folder.parent
+    mode = _mode(folder, option, path)
+    if mode is None or not stat.S_ISDIR(mode):
         raise _refusal(option, "in a folder that exists", path)
     try:
         existing = os.stat(path)
@@ -131,14 +135,14 @@ def _target(path: PathLike, option: str) -> tuple[Path, os.stat_result | None]:
     return target, existing
 
 
-def _mode(path: Path, option: str, shown: PathLike) -> int | None:
+def _mode(path: Path, option: str, named: PathLike) -> int | None:
     """The type and permissions of a file; None if it does not exist."""
     try:
         return os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as error:
-        raise _refusal(option, f"a name that can be written ({_words(error)})", shown) from None
+        raise _refusal(option, f"a name that can be written ({_words(error)})", named) from None
 
 
 def _same(a: Path, b: Path) -> bool:
@@ -153,4 +157,4 @@ def _words(error: Exception) -> str:
 
 
 def _refusal(option: str, rule: str, path: PathLike) -> ConfigError:
-    return ConfigError(f"{option} must be {rule}, got {os.fspath(path)!r}")
+    return ConfigError(f"{option} must be {rule}, got {shown(os.fspath(path))}")

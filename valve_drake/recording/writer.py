@@ -4,20 +4,19 @@
 the disk, so that no tick waits for it. The file's bytes depend on the messages alone: chunks are closed by size, by the
 messages' own time and by `flush`, never by the clock on the wall, and nothing of the machine or the day is written.
 
-While it is being written the log is FILE.active; it is renamed to FILE when it is complete. Whatever kills the
-program, all but the last FLUSH_PERIOD of the log's own time can be read back (reader.py).
+While it is being written the log is FILE.active (active.py); it is renamed to FILE when it is complete. Whatever kills
+the program, all but the last FLUSH_PERIOD of the log's own time can be read back (reader.py).
 
 When the disk refuses (full, gone) or falls MAX_BACKLOG behind, logging stops and the loop goes on: `error`
 says why, the next write tells Python's logging so, once, and closing raises LogError.
 """
 
-import contextlib
 import dataclasses
 import logging
 import os
 import queue
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -25,25 +24,31 @@ from typing import Any, Self
 from google.protobuf.message import Message as Proto
 from mcap.records import Attachment, Channel, Schema
 
+from valve_drake.checks import OperationFailed
 from valve_drake.recording import schemas
-from valve_drake.recording.container import CHUNK_SIZE, Chunk, McapFile, active, open_active, publish
+from valve_drake.recording.active import ActiveFile
+from valve_drake.recording.container import CHUNK_SIZE, Chunk, McapFile
 from valve_drake.recording.foxglove import NANO, nanoseconds
 
 FLUSH_PERIOD = NANO // 2  # of the messages' time [ns]
 MAX_BACKLOG = 256 << 20  # waiting for the disk [bytes]
 
 
-class LogError(Exception):
+class LogError(OperationFailed):
     """A log could not be written to its end. Its text is one clear line for the user."""
 
 
 class LogWriter:
-    """Writes one log. Use it as a context manager: leaving it, for whatever reason, completes the file."""
+    """Writes one log. Use it as a context manager: leaving it, for whatever reason, completes the file.
 
-    def __init__(self, path: str | os.PathLike):
-        self.path = Path(path)
-        self._file = open_active(self.path)
-        self._mcap = McapFile(self._file)
+    Only a log that holds no message yet when an exception comes is not kept: the run was refused before it began.
+    path: the log's name, the next free one if `path` is taken (ActiveFile, also for the arguments); `note` says so.
+    """
+
+    def __init__(self, path: str | os.PathLike, *, companions: Sequence[str] = (), overwrite: bool = False):
+        self._file = ActiveFile(Path(path), companions, overwrite)
+        self.path, self.note = self._file.path, self._file.note
+        self._mcap = McapFile(self._file.file)
         self._chunk = Chunk()
         self._schemas: dict[str, int] = {}  # full name -> id
         self._channels: dict[str, _Channel] = {}
@@ -59,6 +64,16 @@ class LogWriter:
     def error(self) -> str:
         """Why logging has stopped; "" while all is well."""
         return self._error
+
+    @property
+    def where(self) -> Path | None:
+        """Where the log is: `path` once it is complete, else FILE.active; None if it was removed."""
+        return self.path if self._closed and not self._error else self._file.where()
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no message yet."""
+        return not self._channels
 
     def write(self, topic: str, message: schemas.Loggable, time: float) -> None:
         """Appends a message of `topic` at `time` [s]. Times must not decrease; a topic keeps one type of message."""
@@ -102,11 +117,15 @@ class LogWriter:
             return
         self._closed = True
         self._close_chunk()
-        self._hand_over(0, self._finish)
-        self._jobs.put(None)
-        self._thread.join()
+        self._end(self._finish)
         if self._error:
             raise LogError(self._error)
+
+    def _end(self, last: Callable[[], None]) -> None:
+        """Has the thread do `last` as its last job, and waits for it."""
+        self._hand_over(0, last)
+        self._jobs.put(None)
+        self._thread.join()
 
     def __enter__(self) -> Self:
         return self
@@ -114,6 +133,10 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if error is not None and self.empty and not self._closed:
+            self._closed = True
+            self._end(self._file.discard)
+            return
         try:
             self.close()
         except LogError:
@@ -151,7 +174,9 @@ class LogWriter:
             logging.getLogger(__name__).error("%s", self._error)
 
     def _stop(self, reason: str) -> None:
-        self._error = self._error or f"logging stopped: {reason}; what was written is in {active(self.path)}"
+        where = self._file.where()
+        left = "nothing of the log is left" if where is None else f"what was written is in {str(where)!r}"
+        self._error = self._error or f"logging stopped: {reason}; {left}"
 
     def _work(self) -> None:
         """The thread: does the jobs in their order, none after a failure."""
@@ -161,15 +186,20 @@ class LogWriter:
                 try:
                     job(*args)
                 except Exception as error:  # whatever it is, it must not end the run
-                    self._stop(error.strerror if isinstance(error, OSError) else repr(error))
+                    self._stop(_words(error))
             self._written += size
         if self._error:
-            with contextlib.suppress(OSError):  # what its buffer still holds has no place to go
-                self._file.close()
+            self._file.close()
 
     def _finish(self) -> None:
         self._mcap.finish()
-        publish(self._file, self.path)
+        self._file.publish()
+
+
+def _words(error: Exception) -> str:
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return str(error) if isinstance(error, OperationFailed) else repr(error)
 
 
 @dataclasses.dataclass
