@@ -15,7 +15,8 @@ from mcap.writer import IndexType, Writer
 from valve_drake.checks import ConfigError
 from valve_drake.messages import Command, Message, RobotState, Segmentation, SegmentationPair, Status
 from valve_drake.recording import schemas
-from valve_drake.recording.reader import LogReader, recover
+from valve_drake.recording.reader import LogReader
+from valve_drake.recording.recovery import recover
 from valve_drake.recording.writer import LogWriter
 
 SECONDS = 3.0

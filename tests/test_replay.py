@@ -19,7 +19,8 @@ from valve_drake.messages import Command, Mode, Status
 from valve_drake.pace import PACE, Pace
 from valve_drake.ports import SLOT, TICK
 from valve_drake.recording import foxglove
-from valve_drake.recording.reader import LogReader, recover
+from valve_drake.recording.reader import LogReader
+from valve_drake.recording.recovery import recover
 from valve_drake.recording.schemas import Encoded, serialized
 from valve_drake.recording.signals import MEASURED
 from valve_drake.recording.writer import LogWriter

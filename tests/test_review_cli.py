@@ -21,7 +21,8 @@ from valve_drake.analysis import export
 from valve_drake.messages import CameraFrame, Command, HandleMark, HandleMarks, Status
 from valve_drake.recording import foxglove
 from valve_drake.recording.container import active
-from valve_drake.recording.reader import LogReader, recover
+from valve_drake.recording.reader import LogReader
+from valve_drake.recording.recovery import recover
 from valve_drake.recording.writer import LogWriter
 
 

@@ -15,11 +15,11 @@ def add(commands: Subcommands) -> None:
 
 
 def command(options: argparse.Namespace) -> int:
-    from valve_drake.recording.reader import recover
+    from valve_drake.recording.recovery import recover
 
-    source = recover(options.log, options.out)
-    count = sum(topic.count for topic in source.topics.values())
-    say(f"{options.out}: {count} messages up to {source.end:.3f} s")
-    for line in source.damage:
+    log = recover(options.log, options.out)
+    count = sum(topic.count for topic in log.topics.values())
+    say(f"{options.out}: {count} messages up to {log.end:.3f} s")
+    for line in log.damage:
         say(f"  {line}")
-    return DAMAGED if source.damage else OK
+    return DAMAGED if log.losses else OK

@@ -10,7 +10,7 @@ import os
 import struct
 import zlib
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import zstandard
 from mcap import records
@@ -18,10 +18,9 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from valve_drake.checks import ConfigError
-
 CHUNK_SIZE = 1 << 20  # a chunk is closed when it is larger [bytes]
 LIBRARY = "valve_drake"
+RECOVERED = "recovered"  # metadata of a recovered log
 
 _HEAD = struct.Struct("<BQ")  # opcode, length of the body
 _MESSAGE = struct.Struct("<BQHIQQ")  # the same, channel, sequence, log time, publish time
@@ -29,51 +28,69 @@ _MESSAGE_HEAD = _MESSAGE.size - _HEAD.size
 _OPCODE = int(Opcode.MESSAGE)
 
 
+class Definition(NamedTuple):
+    """A schema or channel, and its bytes."""
+
+    record: records.Schema | records.Channel
+    data: bytes
+
+    @property
+    def key(self) -> tuple[type, int]:
+        return type(self.record), self.record.id
+
+
+def definition(record: records.Schema | records.Channel) -> Definition:
+    """A schema or channel for chunks."""
+    return Definition(record, _bytes_of(record))
+
+
 class Chunk:
-    """Records that will be compressed together."""
+    """Records that will be compressed together. It defines its own channels, so that it can be read alone."""
 
     def __init__(self) -> None:
-        self.definitions: list[records.Schema | records.Channel] = []
+        self.definitions: dict[tuple[type, int], Definition] = {}
         self.index: dict[int, list[int]] = collections.defaultdict(list)  # channel -> time, offset, time, offset, ...
         self.parts: list[bytes] = []
         self.size = 0
 
-    def define(self, definition: records.Schema | records.Channel) -> None:
-        """Adds a schema or channel, right before its first message."""
-        self.definitions.append(definition)
-        data = _bytes_of(definition)
-        self.parts.append(data)
-        self.size += len(data)
+    def define(self, *definitions: Definition) -> None:
+        """Adds schemas and channels, right before the first message of theirs, unless they are here."""
+        for one in definitions:
+            if one.key not in self.definitions:
+                self.definitions[one.key] = one
+                self.parts.append(one.data)
+                self.size += len(one.data)
 
-    def add(self, channel: int, when: int, sequence: int, data: bytes) -> None:
-        """Adds a message; `when` [ns]."""
+    def add(self, channel: int, when: int, sequence: int, data: bytes, published: int | None = None) -> None:
+        """Adds a message; `when` it is logged, and `published` if that is another time [ns]."""
         self.index[channel] += (when, self.size)
         length = len(data)
-        self.parts += (_MESSAGE.pack(_OPCODE, _MESSAGE_HEAD + length, channel, sequence, when, when), data)
+        at = when if published is None else published
+        self.parts += (_MESSAGE.pack(_OPCODE, _MESSAGE_HEAD + length, channel, sequence, when, at), data)
         self.size += _MESSAGE.size + length
 
 
 class McapFile:
     """Writes an MCAP file of zstd chunks, with all indexes and a CRC on every byte. Same calls, same bytes."""
 
-    def __init__(self, file: IO[bytes]):
+    def __init__(self, file: IO[bytes], library: str = LIBRARY, profile: str = ""):
         self._file = file
         self._position = 0
         self._crc = 0  # of the section so far
-        self._definitions: list[records.Schema | records.Channel] = []
+        self._definitions: dict[tuple[type, int], Definition] = {}  # of all chunks, for the summary
         self._chunks: list[records.ChunkIndex] = []
         self._attachments: list[records.AttachmentIndex] = []
         self._metadata: list[records.MetadataIndex] = []
         self._counts: collections.Counter[int] = collections.Counter()  # of messages by channel
         self._write(MAGIC)
-        self._add(records.Header(profile="", library=LIBRARY))
+        self._add(records.Header(profile=profile, library=library))
 
     def add_chunk(self, chunk: Chunk) -> None:
-        """Compresses and writes a chunk that has messages."""
+        """Compresses and writes a chunk."""
         content = b"".join(chunk.parts)
         times = [when for index in chunk.index.values() for when in index[0::2]]
         data = zstandard.compress(content)
-        span = {"message_start_time": min(times), "message_end_time": max(times)}
+        span = {"message_start_time": min(times, default=0), "message_end_time": max(times, default=0)}
         sizes = {"compression": "zstd", "uncompressed_size": len(content)}
         offset, length = self._add(records.Chunk(data=data, uncompressed_crc=zlib.crc32(content), **span, **sizes))
         offsets = {}
@@ -81,7 +98,7 @@ class McapFile:
             body = struct.pack(f"<HI{len(index)}Q", channel, 8 * len(index), *index)
             offsets[channel], _ = self._write(_HEAD.pack(Opcode.MESSAGE_INDEX, len(body)) + body)
             self._counts[channel] += len(index) // 2
-        self._definitions += chunk.definitions
+        self._definitions |= {key: one for key, one in chunk.definitions.items() if key not in self._definitions}
         self._chunks.append(
             records.ChunkIndex(
                 chunk_start_offset=offset,
@@ -121,8 +138,9 @@ class McapFile:
         """Ends the data and writes the summary, from which readers seek."""
         self._add(records.DataEnd(self._crc))
         self._crc, start = 0, self._position
-        channels = [d for d in self._definitions if isinstance(d, records.Channel)]
-        schemas = [d for d in self._definitions if isinstance(d, records.Schema)]
+        defined = [one.record for one in self._definitions.values()]
+        channels = [record for record in defined if isinstance(record, records.Channel)]
+        schemas = [record for record in defined if isinstance(record, records.Schema)]
         statistics = records.Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(channels),
@@ -177,25 +195,3 @@ def _bytes_of(record: records.McapRecord) -> bytes:
 def active(path: Path) -> Path:
     """Where a log stands until it is complete."""
     return path.with_name(path.name + ".active")
-
-
-def open_active(path: Path) -> IO[bytes]:
-    """Opens FILE.active of a log for writing; ConfigError if that cannot be."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return open(active(path), "wb")
-    except OSError as error:
-        raise ConfigError(f"log {path} cannot be written: {error.strerror}") from None
-
-
-def publish(file: IO[bytes], path: Path) -> None:
-    """Makes the finished FILE.active the log FILE, in one step and lastingly."""
-    file.flush()
-    os.fsync(file.fileno())
-    file.close()
-    os.replace(active(path), path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

@@ -1,65 +1,62 @@
-"""The log's reader: whole, unfinished, cut off and damaged logs through one path.
+"""The log's reader: MCAP files of every program; whole, unfinished, cut off and damaged ones through one path.
 
 Opening a log reads it once from end to end, checks every CRC and notes where each sound message is. It never gives
 up: what cannot be read is named in `damage`, one line each, and everything else is there. Every record
 proves its own end, so a damaged one costs only itself: reading goes on at the next that is sound.
+
+The summary is not needed: it is held against what was read. Definitions of topics are taken from wherever they stand:
+the data, the summary, or a chunk that is damaged (and `damage` says so). Messages without a definition are kept under
+topics /unknown/channel_N.
 """
 
-import collections
 import dataclasses as dc
 import mmap
 import os
 import re
 import struct
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from io import BytesIO
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from google.protobuf.message import Message as Proto
-from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Metadata, Schema, Statistics
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.records import Attachment, Channel, DataEnd, Footer, Header, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap_protobuf.decoder import DecoderFactory
 
 from valve_drake.checks import ConfigError
 from valve_drake.messages import Message
+from valve_drake.recording import records as mcap_records
 from valve_drake.recording import schemas
-from valve_drake.recording.container import CHUNK_SIZE, McapFile, active, open_active, publish
-from valve_drake.recording.container import Chunk as NewChunk
+from valve_drake.recording.container import LIBRARY, RECOVERED, active
 from valve_drake.recording.foxglove import NANO
-from valve_drake.recording.writer import LogError
+from valve_drake.recording.records import Buffer, Frame, Unsound
 
-_HEAD = struct.Struct("<BQ")  # opcode, length of the body
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_INDEX = struct.Struct("<HI")  # channel, size of the index
-_FOOTER_SIZE = _HEAD.size + 20
-_KINDS: dict[int, type[McapRecord]] = {
-    Opcode.HEADER: Header,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.CHUNK: Chunk,
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.STATISTICS: Statistics,
-    Opcode.METADATA: Metadata,
-    Opcode.DATA_END: DataEnd,
-}
+INDEX_LIMIT = 256 << 20  # kept in memory; raise it if logs of hours are read too slowly [bytes]
+LONGEST = 200  # of a reason in an error line [characters]
+DEFINITIONS_LIMIT = 64 << 20  # schemas and channels, in all [bytes]
+
+_ALWAYS = frozenset((Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END))
+_LOSSLESS = frozenset((Opcode.MESSAGE_INDEX, Opcode.STATISTICS, Opcode.DATA_END, Opcode.FOOTER, Opcode.CHUNK_INDEX))
 _BEGINNING = re.compile(rb"(?s)(?=[\x06\x09\x0c\x0f].{4}\x00{4})")  # perhaps a chunk, attachment, metadata, end of data
+_ANYTHING = re.compile(rb"(?s)(?=[\x03-\x0f].{4}\x00{4})")  # perhaps a record
+_CHAIN = 3  # records one after the other that prove where a record without a CRC begins
 _OTHERS = {b"#ROSBAG": "a ROS 1 bag", b"SQLite format 3": "a ROS 2 bag", b"RRF": "a Rerun recording"}
+_DAMAGE = (ValueError, struct.error)  # what parsing damaged bytes raises
 
 
 class Record(NamedTuple):
     """One message as it stands in the file."""
 
     topic: str
-    when: int  # [ns]
-    sequence: int  # counts the topic's messages from 0
+    when: int  # logged [ns]
+    sequence: int  # counts the topic's messages from 0 in logs of this program
     data: bytes
+    published: int | None = None  # [ns]; None: when it was logged
+    channel: int | None = None  # its channel's id; None: the topic's first channel
 
     @property
     def time(self) -> float:
@@ -70,57 +67,100 @@ class Record(NamedTuple):
 class Topic:
     """What a log holds of one topic."""
 
-    schema: str
+    schema: str  # several names if its channels differ, "" if none is known
     count: int = 0
-    start: float = 0.0  # of the first message [s]
-    end: float = 0.0  # of the last [s]
+    start: float = 0.0  # the earliest message [s]
+    end: float = 0.0  # the latest [s]
 
 
-class _Row(NamedTuple):
-    """A message within its chunk: where its bytes are."""
+@dc.dataclass
+class _Block:
+    """Messages that lie together: those of a chunk, or a run of them outside of chunks."""
 
-    start: int
+    chunk: mcap_records.ChunkAt | None
+    start: int  # of the run, or where its records are in the file or in the unpacked chunk
     end: int
-    when: int
-    sequence: int
+    channels: frozenset[int]
+    first: int  # the earliest message [ns]
+    last: int
+    index: tuple[np.ndarray, np.ndarray] | None  # positions (n,), rows (n,); None: too many to be kept
 
 
-class _Chunk(NamedTuple):
-    """A sound chunk: where it is, its span of time, its messages by channel."""
+@dc.dataclass
+class _Gap:
+    """Bytes that are no sound record."""
 
-    offset: int
-    start: int  # [ns]
-    end: int
-    rows: dict[int, list[_Row]]
+    blocks: int  # sound ones before it
+    position: int
+    size: int
+    opcode: int | None  # of the record, where its end is known
+    reason: str
+    closed: bool  # the end of the data has been read before it
 
 
 class LogReader:
-    """Reads a log, whatever has happened to it.
+    """Reads a log, whatever has happened to it and whoever wrote it.
 
-    damage: what could not be read, in lines for people; empty for a whole log.
-    topics: Topic by name. metadata: by name, then by key. attachments: by name. start, end [s].
+    damage: what could not be read, in lines for people; empty for a whole log. losses: those of them that mean
+    that something recorded is gone; a log that only breaks off has none, for all that was written is there.
+    lost_messages: how many are gone; None if that cannot be known.
+    library, profile: the writer's, from the header. own: this program wrote it, or the header is lost.
+    topics: Topic by name. metadata: by name, then by key; the last of a name. all_metadata: all records.
+    attachments: by name, the last of a name, loaded when asked for. start, end: of all messages [s].
     Raises ConfigError if the file is no MCAP log at all.
     """
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
         self.damage: list[str] = []
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.attachments: dict[str, Attachment] = {}
+        self.losses: list[str] = []
+        self.lost_messages: int | None = 0
+        self.all_metadata: list[Metadata] = []
         self._data = _open(self.path)
-        self._ended = False  # the file has its closing magic
+        self._size = len(self._data)
+        self._header: Header | None = None
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._statistics: Statistics | None = None
-        self._chunks: list[_Chunk] = []
-        self._decoders: dict[str, Callable[[bytes], Message | Proto]] = {}
-        if self._data[: len(MAGIC)] != MAGIC:
-            self.damage.append("the file's first bytes are damaged")
-        self._read_data(self._read_summary())
+        self._attachments: list[Frame] = []
+        self._blocks: list[_Block] = []
+        self._index_bytes = self._definition_bytes = 0
+        self._decoders: dict[int, Callable[[bytes], Message | Proto]] = {}
+        self._unpacked: tuple[int, Buffer] | None = None  # the chunk that was read last: where, content
+        counts = np.zeros(1 << 16, np.int64)
+        self._counts, self._next = counts, counts.copy()  # by channel: messages, highest number + 1
+        self._first, self._last = np.full(1 << 16, np.iinfo(np.uint64).max, np.uint64), counts.astype(np.uint64)
+        _Pass(self).run()
+        self.attachments: Mapping[str, Attachment] = _Attachments(self)
         self.topics = self._collect_topics()
         filled = [topic for topic in self.topics.values() if topic.count > 0]
         self.start = min((topic.start for topic in filled), default=0.0)
         self.end = max((topic.end for topic in filled), default=0.0)
+
+    @property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        return {record.name: record.metadata for record in self.all_metadata}
+
+    @property
+    def library(self) -> str | None:
+        return self._header.library if self._header else None
+
+    @property
+    def profile(self) -> str:
+        return self._header.profile if self._header else ""
+
+    @property
+    def own(self) -> bool:
+        return self.library in (None, LIBRARY)
+
+    @property
+    def past_damage(self) -> str:
+        """The damage of the logs that this one was recovered from; "" if there was none."""
+        return self.metadata.get(RECOVERED, {}).get("damage", "")
+
+    @property
+    def definitions(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
+        """Schemas and channels by id."""
+        return self._schemas, self._channels
 
     def records(
         self, topics: Iterable[str] | None = None, start: float = -np.inf, end: float = np.inf
@@ -141,9 +181,11 @@ class LogReader:
     def decode(self, record: Record) -> Message | Proto:
         """The message in a record of this log; ConfigError if this version of the program cannot hold it."""
         try:
-            return self._decoder(record.topic)(record.data)
-        except (DecodeError, TypeError, ValueError) as error:
-            reason = f"{self.path}: {record.topic} was not recorded by this version of the program: {error}"
+            return self._decoder(record)(record.data)
+        except (DecodeError, TypeError, ValueError, McapError, KeyError, AttributeError) as error:
+            reason = (
+                f"{self.path}: {record.topic} was not recorded by this version of the program: {str(error)[:LONGEST]}"
+            )
             raise ConfigError(reason) from error
 
     def series(self, topic: str, fields: Iterable[str]) -> dict[str, np.ndarray]:
@@ -160,208 +202,472 @@ class LogReader:
                 column.append(_reach(message, name.split(".")))
         return {"time": np.array(times)} | {name: _stack(column) for name, column in columns.items()}
 
-    def copy_to(self, file: IO[bytes]) -> None:
-        """Writes all that could be read as a new MCAP file."""
-        mcap, chunk = McapFile(file), NewChunk()
-        for definition in (*self._schemas.values(), *self._channels.values()):
-            chunk.define(definition)
-        for part in self.attachments.values():
-            mcap.add_attachment(part)
-        ids = {channel.topic: channel.id for channel in self._channels.values()}
-        for record in self.records():
-            chunk.add(ids[record.topic], record.when, record.sequence, record.data)
-            if chunk.size > CHUNK_SIZE:
-                mcap.add_chunk(chunk)
-                chunk = NewChunk()
-        if chunk.index:
-            mcap.add_chunk(chunk)
-        count = sum(topic.count for topic in self.topics.values())
-        recovered = {"messages": str(count), "damage": "; ".join(self.damage)}
-        for name, facts in (self.metadata | {"recovered": recovered}).items():
-            mcap.add_metadata(name, facts)
-        mcap.finish()
+    def timing(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """When each message of each topic was logged (n,) [ns] and its number (n,), in the order of the file."""
+        whens: dict[int, list[np.ndarray]] = {}
+        numbers: dict[int, list[np.ndarray]] = {}
+        for block in self._blocks:
+            rows = self._rows(block)[1]
+            order = np.argsort(rows["channel"], kind="stable")
+            channels, when, number = (rows[name][order] for name in ("channel", "when", "sequence"))
+            starts = np.flatnonzero(np.diff(channels, prepend=channels[:1] ^ 1))
+            for first, end in zip(starts, [*starts[1:], len(rows)]):
+                whens.setdefault(int(channels[first]), []).append(when[first:end])
+                numbers.setdefault(int(channels[first]), []).append(number[first:end])
+        ids: dict[str, list[int]] = {topic: [] for topic in self.topics}
+        for channel in self._channels.values():
+            ids[channel.topic] += [channel.id] if channel.id in whens else []
+        return {
+            topic: (
+                np.concatenate([np.empty(0, np.uint64), *(part for id in some for part in whens[id])]),
+                np.concatenate([np.empty(0, np.uint32), *(part for id in some for part in numbers[id])]),
+            )
+            for topic, some in ids.items()
+        }
 
-    # ---- the file's records
+    def load_attachments(self) -> Iterator[Attachment]:
+        """All attachments in the order of the file, one at a time."""
+        return (mcap_records.attachment(self._data, record) for record in self._attachments)
 
-    def _read_summary(self) -> int:
-        """Definitions from the summary that a finished file ends with -> where the data section ends."""
-        size = len(self._data)
-        footer_at = size - len(MAGIC) - _FOOTER_SIZE
-        self._ended = self._data[size - len(MAGIC) :] == MAGIC and footer_at >= len(MAGIC)
-        if not self._ended:
-            return size
-        footer = Footer.read(ReadDataStream(BytesIO(self._data[footer_at + _HEAD.size : size])))
-        if footer.summary_start == 0:
-            return footer_at
-        if footer.summary_crc not in (0, self._crc(footer.summary_start, size - len(MAGIC) - 4)):
-            self.damage.append("the summary is damaged; the messages were read without it")
-            return size
-        position = footer.summary_start
-        while position < footer_at:
-            opcode, length = _HEAD.unpack_from(self._data, position)
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
-                self._take(self._record(position)[0], position)
-            position += _HEAD.size + length
-        return footer.summary_start
+    # ---- what the pass over the file (_Pass) finds
 
-    def _read_data(self, limit: int) -> None:
-        """Takes all sound records before `limit` and says what is missing between them."""
-        gaps: list[tuple[int, int]] = []  # sound chunks before, bytes
-        position, complete = len(MAGIC), False
-        while position < limit and not complete:
-            try:
-                record, after = self._record(position)
-                self._take(record, position)
-            except Exception:  # damaged bytes can fail in any way while they are parsed
-                after = self._next_sound(position + 1, limit)
-                gaps.append((len(self._chunks), after - position))
-            else:
-                complete = isinstance(record, DataEnd)
-                if complete and not gaps and record.data_section_crc not in (0, self._crc(0, position)):
-                    self.damage.append("bytes outside the messages are damaged: the CRC of the whole does not match")
-            position = after
-        if not self._ended and not complete and gaps and position == limit:
-            gaps.pop()  # the torso of the last record
-        for chunks, size in gaps:
-            before = f"after t = {self._chunks[chunks - 1].end / NANO:.3f} s" if chunks > 0 else "at the beginning"
-            after = ""
-            if chunks < len(self._chunks):
-                after = f", sound again from t = {self._chunks[chunks].start / NANO:.3f} s"
-            self.damage.append(f"{size} bytes are damaged {before}{after}")
-        if not self._ended:
-            last = f"t = {self._chunks[-1].end / NANO:.3f} s" if self._chunks else "its beginning"
-            self.damage.append(f"the log breaks off after {last}: killed, cut off or still being written")
-
-    def _record(self, position: int) -> tuple[McapRecord | None, int]:
-        """The record at `position` (None: an index, not needed), and where the next begins; raises if not sound."""
-        opcode, length = _HEAD.unpack_from(self._data, position)
-        start = position + _HEAD.size
-        end = start + length
-        if opcode == Opcode.MESSAGE_INDEX and length == _INDEX.size + _INDEX.unpack_from(self._data, start)[1]:
-            return None, end
-        if opcode not in _KINDS or end > len(self._data):
-            raise ValueError("no record")
-        stream = ReadDataStream(BytesIO(self._data[start:end]))
-        record = _KINDS[opcode].read(stream)
-        if stream.count != length:
-            raise ValueError("a record's length does not match its content")
-        stored = int.from_bytes(self._data[end - 4 : end], "little")
-        if opcode == Opcode.ATTACHMENT and stored != self._crc(start, end - 4):
-            raise ValueError("an attachment's CRC does not match")
-        return record, end
-
-    def _next_sound(self, position: int, limit: int) -> int:
-        """Where the next record that can be proved sound begins; `limit` if there is none."""
-        for found in _BEGINNING.finditer(self._data, position, limit):
-            try:
-                record, _ = self._record(found.start())
-                if isinstance(record, Chunk):
-                    _content(record)
-            except Exception:  # no record, or a damaged one
-                continue
-            return found.start()
-        return limit
-
-    def _take(self, record: McapRecord | None, position: int) -> None:
-        """Keeps what a sound record says."""
-        match record:
-            case Schema():
-                self._schemas.setdefault(record.id, record)
-            case Channel():
-                self._channels.setdefault(record.id, record)
-            case Chunk():
-                rows = self._index(_content(record))
-                times = [row.when for found in rows.values() for row in found]
-                self._chunks.append(_Chunk(position, min(times, default=0), max(times, default=0), rows))
-            case Attachment():
-                self.attachments[record.name] = record
-            case Metadata():
-                self.metadata[record.name] = record.metadata
-            case Statistics():
-                self._statistics = record
-
-    def _index(self, content: bytes) -> dict[int, list[_Row]]:
-        """Where the messages of a chunk's content are; takes the definitions in it."""
-        rows: dict[int, list[_Row]] = collections.defaultdict(list)
-        position = 0
-        while position < len(content):
-            opcode, length = _HEAD.unpack_from(content, position)
-            start = position + _HEAD.size
-            position = start + length
-            if opcode == Opcode.MESSAGE:
-                channel, sequence, when, _ = _MESSAGE.unpack_from(content, start)
-                rows[channel].append(_Row(start + _MESSAGE.size, position, when, sequence))
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._take(_KINDS[opcode].read(ReadDataStream(BytesIO(content[start:position]))), start)
-        return dict(rows)
+    def _add_block(
+        self, chunk: mcap_records.ChunkAt | None, content: Buffer, found: mcap_records.Scan, start: int
+    ) -> None:
+        rows = mcap_records.rows(content, found.positions)
+        if len(rows) == 0:
+            return
+        channel, when = rows["channel"], rows["when"]
+        np.add.at(self._counts, channel, 1)
+        np.maximum.at(self._next, channel, rows["sequence"].astype(np.int64) + 1)
+        np.minimum.at(self._first, channel, when)
+        np.maximum.at(self._last, channel, when)
+        index = (found.positions, rows)
+        size = found.positions.nbytes + rows.nbytes
+        keep = self._index_bytes + size <= INDEX_LIMIT
+        self._index_bytes += size if keep else 0
+        channels = frozenset(np.unique(channel).tolist())
+        span = int(when.min()), int(when.max())
+        self._blocks.append(_Block(chunk, start, found.end, channels, *span, index if keep else None))
 
     def _collect_topics(self) -> dict[str, Topic]:
         topics: dict[str, Topic] = {}
-        orphans = total = 0
         for channel in self._channels.values():
-            schema = self._schemas.get(channel.schema_id)
-            topics[channel.topic] = Topic(schema.name if schema else "")
-        for chunk in self._chunks:
-            for channel_id, rows in chunk.rows.items():
-                total += len(rows)
-                if channel_id not in self._channels:
-                    orphans += len(rows)
-                    continue
-                topic = topics[self._channels[channel_id].topic]
-                topic.start = topic.start if topic.count > 0 else rows[0].when / NANO
-                topic.end = rows[-1].when / NANO
-                topic.count += len(rows)
-        if orphans > 0:
-            self.damage.append(f"{orphans} messages cannot be read: their topics' definitions are lost")
-        if self._statistics is not None and self._statistics.message_count != total:
-            missing = self._statistics.message_count - total
-            self.damage.append(f"{missing} of {self._statistics.message_count} messages are missing")
+            known = self._schemas.get(channel.schema_id)
+            name = known.name if known else ""
+            topic = topics.setdefault(channel.topic, Topic(name))
+            if name not in topic.schema.split(", "):
+                topic.schema = f"{topic.schema}, {name}"
+            if count := int(self._counts[channel.id]):
+                first, last = int(self._first[channel.id]) / NANO, int(self._last[channel.id]) / NANO
+                topic.start = min(topic.start, first) if topic.count else first
+                topic.end = max(topic.end, last) if topic.count else last
+                topic.count += count
         return topics
 
-    def _select(self, wanted: set[int], start: float, end: float) -> Iterator[Record]:
-        for chunk in self._chunks:
-            if chunk.start / NANO > end or chunk.end / NANO < start:
-                continue
-            found = sorted((row, channel) for channel in wanted & chunk.rows.keys() for row in chunk.rows[channel])
-            if not found:
-                continue
-            content = _content(self._record(chunk.offset)[0])
-            for row, channel in found:
-                if start <= row.when / NANO <= end:
-                    yield Record(self._channels[channel].topic, row.when, row.sequence, content[row.start : row.end])
+    # ---- messages
 
-    def _decoder(self, topic: str) -> Callable[[bytes], Message | Proto]:
-        if topic not in self._decoders:
-            channel = next(c for c in self._channels.values() if c.topic == topic)
+    def _rows(self, block: _Block) -> tuple[np.ndarray, np.ndarray]:
+        """Where a block's messages are, and their heads."""
+        if block.index is not None:
+            return block.index
+        content = self._content(block)
+        found = mcap_records.scan(content, block.start, block.end, only_messages=block.chunk is None)
+        return found.positions, mcap_records.rows(content, found.positions)
+
+    def _content(self, block: _Block) -> Buffer:
+        if block.chunk is None or not block.chunk.compression:
+            return self._data
+        if self._unpacked is None or self._unpacked[0] != block.chunk.start:
+            self._unpacked = None  # never two at a time
+            self._unpacked = block.chunk.start, mcap_records.unpacked(self._data, block.chunk)[0]
+        return self._unpacked[1]
+
+    def _select(self, wanted: set[int], start: float, end: float) -> Iterator[Record]:
+        topics = {id: channel.topic for id, channel in self._channels.items()}
+        bounded = start > -np.inf or end < np.inf
+        for block in self._blocks:
+            if block.first / NANO > end or block.last / NANO < start or wanted.isdisjoint(block.channels):
+                continue
+            positions, rows = self._rows(block)
+            if not wanted >= block.channels:
+                here = wanted & block.channels
+                match = rows["channel"] == here.pop() if len(here) == 1 else np.isin(rows["channel"], list(here))
+                positions, rows = positions[match], rows[match]
+            content = self._content(block)
+            columns = (rows[name].tolist() for name in ("length", "channel", "sequence", "when", "published"))
+            for position, length, channel, sequence, when, published in zip(positions.tolist(), *columns):
+                if bounded and not start <= when / NANO <= end:
+                    continue
+                data = content[position + _DATA : position + mcap_records.HEAD.size + length]
+                yield Record(topics[channel], when, sequence, data, published, channel)
+
+    def _decoder(self, record: Record) -> Callable[[bytes], Message | Proto]:
+        id = record.channel
+        if id is None:
+            id = next(channel.id for channel in self._channels.values() if channel.topic == record.topic)
+        if id not in self._decoders:
+            channel = self._channels[id]
             schema = self._schemas.get(channel.schema_id)
             parse = DecoderFactory().decoder_for(channel.message_encoding, schema)
-            if parse is None:
+            if parse is None or schema is None:
                 raise ValueError(f"its messages are {channel.message_encoding!r}, not protobuf")
             kind = schemas.kind_named(schema.name)
-            self._decoders[topic] = parse if kind is None else lambda data: schemas.from_proto(kind, parse(data))
-        return self._decoders[topic]
-
-    def _crc(self, start: int, end: int) -> int:
-        with memoryview(self._data) as view:
-            return zlib.crc32(view[start:end])
+            self._decoders[id] = parse if kind is None else lambda data: schemas.from_proto(kind, parse(data))
+        return self._decoders[id]
 
 
-def recover(source: str | os.PathLike, path: str | os.PathLike) -> LogReader:
-    """Writes all that can be read of the log `source` to a new, sound log `path`; returns the reader of `source`.
+_DATA = mcap_records.ROW.itemsize  # of a message, from the beginning of its record [bytes]
 
-    Metadata `recovered` of the new log tells the number of messages and the damage. Raises ConfigError if
-    `source` is no log, LogError if the new one cannot be written.
-    """
-    log, path = LogReader(source), Path(path)
-    if path.resolve() == log.path.resolve():
-        raise ConfigError(f"{path} cannot be recovered onto itself")
-    with open_active(path) as file:
+
+class _Attachments(Mapping[str, Attachment]):
+    """A log's attachments by name, the last of a name; each is loaded when it is asked for."""
+
+    def __init__(self, log: LogReader):
+        self._log = log
+        heads = (mcap_records.attachment(log._data, record, load=False) for record in log._attachments)
+        self._records = {head.name: record for head, record in zip(heads, log._attachments)}
+
+    def __getitem__(self, name: str) -> Attachment:
+        return mcap_records.attachment(self._log._data, self._records[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._records)
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+
+class _Pass:
+    """The one pass over a file: fills a LogReader with what is sound and says what is not."""
+
+    def __init__(self, log: LogReader):
+        self.log, self.data, self.size = log, log._data, log._size
+        self.gaps: list[_Gap] = []
+        self.hurt_chunks: list[mcap_records.ChunkAt] = []
+        self.in_hurt_chunks = 0  # messages, by the indexes behind those chunks
+        self.counting = False  # the last chunk was damaged: its indexes follow
+        self.data_end: int | None = None  # where the data ends and the summary begins
+        self.data_matches = True  # with the CRC of the whole data
+        self.summary: list[tuple[Frame, Schema | Channel]] = []
+        self.statistics: Statistics | None = None
+        self.footer: Footer | None = None
+        self.footer_crc_at = 0
+        self.end = 0  # of what was read
+        self.loose = False  # messages stand outside of chunks
+        self.closed = self.data[self.size - len(MAGIC) :] == MAGIC and self.size >= 2 * len(MAGIC)
+
+    def run(self) -> None:
+        if self.data[: len(MAGIC)] != MAGIC:
+            self._say("the file's first bytes are damaged")
+        self._walk(self.size - len(MAGIC) if self.closed else self.size)
+        summary_is_sound = self._check_summary()
+        self._define_missing(summary_is_sound)
+        self._tell(summary_is_sound)
+
+    # ---- records
+
+    def _walk(self, limit: int) -> None:
+        position = len(MAGIC)
+        while position < limit and self.footer is None:
+            record, reason = None, ""
+            try:
+                record = mcap_records.frame(self.data, position, limit)
+                after = self._take(record, position, limit)
+            except _DAMAGE as error:
+                reason = error.reason if isinstance(error, Unsound) else ""
+                framed = record is not None and record.opcode in _NAMES and self._follows(record.end, limit, 1)
+                after = record.end if record is not None and framed else self._next_sound(position, limit)
+                opcode = record.opcode if record is not None and framed else None
+                closed = self.data_end is not None
+                self.gaps.append(_Gap(len(self.log._blocks), position, after - position, opcode, reason, closed))
+            position = after
+        self.end = position
+
+    def _take(self, record: Frame, position: int, limit: int) -> int:
+        """Keeps what a sound record says -> where the next begins."""
+        log, opcode = self.log, record.opcode
+        if opcode == Opcode.MESSAGE:
+            return self._take_run(position, limit)
+        if opcode == Opcode.MESSAGE_INDEX:
+            _, size = _INDEX.unpack_from(self.data, record.start)
+            if record.end - record.start < _INDEX.size + size:
+                raise Unsound
+            self.in_hurt_chunks += size // 16 if self.counting else 0
+            return record.end
+        self.counting = False
+        if opcode == Opcode.CHUNK:
+            self._take_chunk(mcap_records.chunk_at(self.data, record))
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            definition = mcap_records.parse(self.data, record)
+            assert isinstance(definition, Schema | Channel)
+            if self.data_end is None:
+                self._define(record, definition)
+            else:
+                self.summary.append((record, definition))
+        elif opcode == Opcode.ATTACHMENT:
+            mcap_records.attachment(self.data, record, load=False)
+            log._attachments.append(record)
+        elif opcode in _NAMES:
+            self._take_other(record, position)
+        elif log.library == LIBRARY or not self._follows(record.end, limit, 1):
+            raise Unsound  # a private record is skipped, but this program writes none
+        return record.end
+
+    def _take_other(self, record: Frame, position: int) -> None:
+        if record.opcode not in _PARSED:
+            return
+        match mcap_records.parse(self.data, record):
+            case Header() as header:
+                self.log._header = self.log._header or header
+            case Metadata() as metadata:
+                self.log.all_metadata.append(metadata)
+            case Statistics() as statistics:
+                self.statistics = statistics
+            case DataEnd() as end:
+                for earlier in self.summary:  # the one before was no end
+                    self._define(*earlier)
+                self.data_end, self.summary, self.statistics = record.end, [], None
+                self.data_matches = end.data_section_crc in (0, mcap_records.crc(self.data, 0, position))
+            case Footer() as footer:
+                rest = self.data[record.end : record.end + len(MAGIC)]
+                if rest != MAGIC and len(rest) == len(MAGIC) and record.end + len(MAGIC) != self.size:
+                    raise Unsound
+                self.footer, self.footer_crc_at = footer, record.start + 16
+
+    def _take_chunk(self, chunk: mcap_records.ChunkAt) -> None:
         try:
-            log.copy_to(file)
-            publish(file, path)
-        except OSError as error:
-            raise LogError(f"{path} cannot be written: {error.strerror}") from error
-    return log
+            content, start, end = mcap_records.unpacked(self.data, chunk)
+        except Unsound:
+            self.hurt_chunks.append(chunk)
+            self.counting = True
+            raise
+        found = mcap_records.scan(content, start, end)
+        for definition in found.definitions:
+            parsed = mcap_records.parse(content, definition)
+            assert isinstance(parsed, Schema | Channel)
+            self._define(definition, parsed)
+        self.log._add_block(chunk, content, found, start)
+        if found.end != end:
+            raise Unsound(f"a chunk holds {end - found.end} bytes that are no records")
+
+    def _take_run(self, position: int, limit: int) -> int:
+        """Messages outside of chunks, up to the next record of another kind."""
+        found = mcap_records.scan(self.data, position, limit, only_messages=True)
+        if len(found.positions) == 0:
+            raise Unsound
+        if not self._follows(found.end, limit, 1):  # the last one's length may be what is damaged
+            last = int(found.positions[-1])
+            if (better := self._next_sound(last, found.end)) < found.end:
+                if last == position:
+                    raise Unsound
+                found = found._replace(positions=found.positions[:-1], end=last)
+                self.loose = True
+                self.log._add_block(None, self.data, found, position)
+                self.gaps.append(_Gap(len(self.log._blocks), last, better - last, None, "", False))
+                return better
+        self.loose = True
+        self.log._add_block(None, self.data, found, position)
+        return found.end
+
+    def _define(self, record: Frame, definition: Schema | Channel) -> None:
+        """Takes a definition unless one of its id is known."""
+        log = self.log
+        if definition.id in (log._schemas if isinstance(definition, Schema) else log._channels):
+            return
+        log._definition_bytes += record.end - record.start
+        if log._definition_bytes > DEFINITIONS_LIMIT:
+            raise Unsound(f"schemas and channels take more than {DEFINITIONS_LIMIT} bytes: the rest is not read")
+        if isinstance(definition, Schema):
+            log._schemas[definition.id] = definition
+        else:
+            log._channels[definition.id] = definition
+
+    # ---- where a sound record begins
+
+    def _follows(self, position: int, limit: int, count: int) -> bool:
+        """Whether records that this program knows begin here, one after the other, or the file ends."""
+        for _ in range(count):
+            if position == limit:
+                return True
+            try:
+                record = mcap_records.frame(self.data, position, limit)
+            except Unsound:
+                return False
+            known = record.opcode in _NAMES or (record.opcode >= 0x80 and self.log.library != LIBRARY)
+            if not known or (record.opcode == Opcode.MESSAGE and record.end - record.start < mcap_records.LEAST):
+                return False
+            position = record.end
+        return True
+
+    def _next_sound(self, damaged: int, limit: int) -> int:
+        """Where the next record that can be proved sound begins; `limit` if there is none.
+
+        Records that have no CRC count only in files whose messages stand outside of chunks: elsewhere
+        they may be the inside of a damaged chunk.
+        """
+        chunked = bool(self.log._blocks or self.hurt_chunks) or self.data[damaged] == Opcode.CHUNK
+        loose = self.loose or not chunked
+        for found in (_ANYTHING if loose else _BEGINNING).finditer(self.data, damaged + 1, limit):
+            position = found.start()
+            try:
+                record = mcap_records.frame(self.data, position, limit)
+                if record.opcode == Opcode.CHUNK:
+                    mcap_records.unpacked(self.data, mcap_records.chunk_at(self.data, record))
+                elif record.opcode == Opcode.ATTACHMENT:
+                    mcap_records.attachment(self.data, record, load=False)
+                elif record.opcode == Opcode.DATA_END and record.end - record.start != 4:
+                    continue
+                elif record.opcode in _ALWAYS:
+                    mcap_records.parse(self.data, record)
+                elif not self._follows(position, limit, _CHAIN):
+                    continue
+            except _DAMAGE:
+                continue
+            return position
+        return limit
+
+    # ---- the summary, and definitions that the data lacks
+
+    def _check_summary(self) -> bool:
+        """Whether the summary agrees with its CRC and lies where the footer says."""
+        if self.footer is None:
+            return False
+        start, stored = self.footer.summary_start, self.footer.summary_crc
+        if start == 0:
+            return not self.summary and self.statistics is None
+        if not len(MAGIC) <= start <= self.footer_crc_at or self.data_end not in (None, start):
+            return False
+        return stored in (0, mcap_records.crc(self.data, start, self.footer_crc_at))
+
+    def _define_missing(self, summary_is_sound: bool) -> None:
+        log = self.log
+        if summary_is_sound:
+            for record, definition in self.summary:
+                self._define(record, definition)
+        else:
+            self.statistics = None
+        written = set(np.flatnonzero(log._counts).tolist())
+        doubtful = 0
+        if written - log._channels.keys() or self._schemas_missing():
+            offered = [definition for _, definition in self.summary] + list(self._salvaged())
+            doubtful = self._use(offered, written)
+        orphans = sorted(written - log._channels.keys())
+        for id in orphans:
+            log._channels[id] = Channel(id, f"/unknown/channel_{id}", "", {}, 0)
+        if doubtful:
+            self._say(f"the definitions of {doubtful} topics come from damaged bytes", lost=True)
+        if orphans:
+            count = int(log._counts[orphans].sum())
+            words = f"{count} messages have lost their topics' definitions: they are kept as {_names(orphans)}"
+            self._say(words, lost=True)
+
+    def _schemas_missing(self) -> set[int]:
+        log = self.log
+        return {channel.schema_id for channel in log._channels.values()} - log._schemas.keys() - {0}
+
+    def _salvaged(self) -> Iterator[Schema | Channel]:
+        """Definitions in damaged chunks."""
+        for chunk in self.hurt_chunks:
+            content = mcap_records.salvaged(self.data, chunk)
+            for record in mcap_records.scan(content, 0, len(content)).definitions:
+                try:
+                    definition = mcap_records.parse(content, record)
+                except _DAMAGE:
+                    continue
+                assert isinstance(definition, Schema | Channel)
+                yield definition
+
+    def _use(self, offered: Sequence[Schema | Channel], written: set[int]) -> int:
+        """Takes doubtful definitions of what would else have none -> channels that they define."""
+        log, doubtful = self.log, 0
+        for channel in (one for one in offered if isinstance(one, Channel)):
+            if channel.id in written and channel.id not in log._channels and channel.topic.isprintable():
+                log._channels[channel.id] = channel
+                doubtful += 1
+        missing = self._schemas_missing()
+        for schema in (one for one in offered if isinstance(one, Schema)):
+            if schema.id in missing and schema.id not in log._schemas:
+                own = schemas.known(schema.name)
+                log._schemas[schema.id] = schema if own is None else dc.replace(schema, data=own)
+        return doubtful
+
+    # ---- what is told
+
+    def _say(self, line: str, lost: bool = False) -> None:
+        self.log.damage.append(line)
+        if lost:
+            self.log.losses.append(line)
+
+    def _tell(self, summary_is_sound: bool) -> None:
+        cut = self.footer is None and not self.closed
+        if cut and self.gaps and self.gaps[-1].position + self.gaps[-1].size == self.end:
+            self.gaps.pop()  # the truncated last record
+        missing = self._missing()
+        lossy = False
+        for gap in self.gaps:
+            behind = gap.closed and self.data_matches
+            lost = not behind and not (missing == 0 and gap.opcode in _LOSSLESS)
+            lossy = lossy or lost
+            self._say(self._where(gap), lost)
+        if self.footer is not None:
+            self._tell_the_end(summary_is_sound)
+        elif self.closed:
+            self._say("the summary is damaged; the messages were read without it")
+        self._tell_missing(missing, lossy)
+        if not self.data_matches and not self.gaps:
+            outside = "a message outside of chunks" if self.loose else "bytes outside the messages"
+            verb = "may be" if self.loose else "are"
+            self._say(f"{outside} {verb} damaged: the CRC of the whole does not match")
+        if cut:
+            blocks = self.log._blocks
+            last = f"t = {blocks[-1].last / NANO:.3f} s" if blocks else "its beginning"
+            self._say(f"the log breaks off after {last}: killed, cut off or still being written")
+
+    def _tell_the_end(self, summary_is_sound: bool) -> None:
+        if not summary_is_sound:
+            self._say("the summary is damaged; the messages were read without it")
+        rest = self.data[self.end : self.end + len(MAGIC)]
+        if rest != MAGIC:
+            self._say("the file's last bytes are damaged")
+        elif self.size > self.end + len(MAGIC):
+            self._say(f"{self.size - self.end - len(MAGIC)} bytes behind the log's end are not read", lost=True)
+
+    def _where(self, gap: _Gap) -> str:
+        blocks = self.log._blocks
+        before = f"after t = {blocks[gap.blocks - 1].last / NANO:.3f} s" if gap.blocks > 0 else "at the beginning"
+        after = f", sound again from t = {blocks[gap.blocks].first / NANO:.3f} s" if gap.blocks < len(blocks) else ""
+        if gap.reason:
+            return f"{gap.reason} ({gap.size} bytes {before}{after})"
+        return f"{gap.size} bytes are damaged {before}{after}"
+
+    def _missing(self) -> int | None:
+        """How many messages are gone: by the summary, else by this program's numbering, else by the indexes."""
+        log = self.log
+        if self.statistics is not None:
+            return max(self.statistics.message_count - int(log._counts.sum()), 0)
+        holes = int((log._next - log._counts).clip(0).sum()) if log.own else None
+        return max(holes or 0, self.in_hurt_chunks) or holes
+
+    def _tell_missing(self, missing: int | None, lossy: bool) -> None:
+        total = int(self.log._counts.sum())
+        self.log.lost_messages = 0 if missing is None and not lossy else missing
+        if self.statistics is not None and total > self.statistics.message_count:
+            self._say(f"the summary counts {self.statistics.message_count} messages, the log holds {total}")
+        elif self.statistics is not None and missing:
+            self._say(f"{missing} of {total + missing} messages are missing", lost=True)
+        elif missing:
+            self._say(f"{missing} messages are missing between others", lost=True)
+
+
+_INDEX = struct.Struct("<HI")  # channel, size of the index
+_NAMES = frozenset(int(opcode) for opcode in Opcode)
+_PARSED = frozenset((Opcode.HEADER, Opcode.METADATA, Opcode.STATISTICS, Opcode.DATA_END, Opcode.FOOTER))
+
+
+def _names(ids: Sequence[int]) -> str:
+    """The topics of channels without a definition, for people."""
+    return f"/unknown/channel_{ids[0]}" if len(ids) == 1 else f"/unknown/channel_{ids[0]} to _{ids[-1]}"
 
 
 def _open(path: Path) -> mmap.mmap:
@@ -383,12 +689,6 @@ def _open(path: Path) -> mmap.mmap:
         raise ConfigError(f"there is no log {path}{hint}") from None
     except OSError as error:
         raise ConfigError(f"log {path} cannot be read: {error.strerror}") from None
-
-
-def _content(chunk: Chunk) -> bytes:
-    """A chunk's records, decompressed; raises unless its CRC matches."""
-    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    return stream.read(size)
 
 
 def _reach(value: Any, names: list[str]) -> Any:

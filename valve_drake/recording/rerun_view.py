@@ -20,7 +20,8 @@ from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrim
 
 from valve_drake.checks import ConfigError
 from valve_drake.recording.layout import PLOTS
-from valve_drake.recording.reader import LogReader, recover
+from valve_drake.recording.reader import LogReader
+from valve_drake.recording.recovery import recover
 from valve_drake.recording.robot_frames import ODOMETRY
 from valve_drake.stations.contract import CAMERAS
 

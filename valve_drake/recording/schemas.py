@@ -16,6 +16,7 @@ A log carries its own schemas, so a reader maps fields by name: what an older lo
 
 import dataclasses as dc
 import functools
+import importlib
 import math
 import operator
 import struct
@@ -141,6 +142,21 @@ def kind_named(schema_name: str) -> type[Message] | None:
     """The message class of a schema's full name; None if it is not one of the program's."""
     package, _, name = schema_name.rpartition(".")
     return _kinds().get(name) if package == PACKAGE else None
+
+
+def known(schema_name: str) -> bytes | None:
+    """The schema data of one of the program's or Foxglove's messages by its full name; None for any other."""
+    kind = kind_named(schema_name)
+    if kind is not None:
+        return schema_data(proto_class(kind))
+    package, _, name = schema_name.rpartition(".")
+    if package != "foxglove" or not name.isidentifier():
+        return None
+    try:
+        module = importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2")
+    except ImportError:
+        return None
+    return schema_data(getattr(module, name))
 
 
 def _kinds() -> dict[str, type[Message]]:

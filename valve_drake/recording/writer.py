@@ -5,7 +5,8 @@ the disk, so that no tick waits for it. The file's bytes depend on the messages 
 messages' own time and by `flush`, never by the clock on the wall, and nothing of the machine or the day is written.
 
 While it is being written the log is FILE.active (active.py); it is renamed to FILE when it is complete. Whatever kills
-the program, all but the last FLUSH_PERIOD of the log's own time can be read back (reader.py).
+the program, all but the last FLUSH_PERIOD of the log's own time can be read back (reader.py). Every chunk defines the
+topics that it holds messages of, so that a damaged chunk never takes another one's meaning with it.
 
 When the disk refuses (full, gone) or falls MAX_BACKLOG behind, logging stops and the loop goes on: `error`
 says why, the next write tells Python's logging so, once, and closing raises LogError.
@@ -27,7 +28,7 @@ from mcap.records import Attachment, Channel, Schema
 from valve_drake.checks import OperationFailed
 from valve_drake.recording import schemas
 from valve_drake.recording.active import ActiveFile
-from valve_drake.recording.container import CHUNK_SIZE, Chunk, McapFile
+from valve_drake.recording.container import CHUNK_SIZE, Chunk, Definition, McapFile, definition
 from valve_drake.recording.foxglove import NANO, nanoseconds
 
 FLUSH_PERIOD = NANO // 2  # of the messages' time [ns]
@@ -50,7 +51,7 @@ class LogWriter:
         self.path, self.note = self._file.path, self._file.note
         self._mcap = McapFile(self._file.file)
         self._chunk = Chunk()
-        self._schemas: dict[str, int] = {}  # full name -> id
+        self._schemas: dict[str, Definition] = {}  # by full name
         self._channels: dict[str, _Channel] = {}
         self._interval = 0  # of FLUSH_PERIOD, that the last message belongs to
         self._handed, self._written = 0, 0  # bytes, to the thread and by it
@@ -90,6 +91,8 @@ class LogWriter:
         channel = self._channels.get(topic) or self._define(topic, kind)
         if kind is not channel.kind:
             raise TypeError(f"{topic} holds {channel.kind.__name__}, got {kind.__name__}")
+        if channel.id not in self._chunk.index:
+            self._chunk.define(channel.schema, channel.record)
         self._chunk.add(channel.id, when, channel.count, data)
         channel.count += 1
 
@@ -144,18 +147,15 @@ class LogWriter:
                 raise
 
     def _define(self, topic: str, kind: type[Proto]) -> "_Channel":
-        """A new topic's channel, and its schema unless another topic has brought it."""
+        """A new topic's channel; topics of one type share a schema."""
         name = kind.DESCRIPTOR.full_name
         if name not in self._schemas:
-            self._schemas[name] = len(self._schemas) + 1
             data = schemas.schema_data(kind)
-            self._chunk.define(Schema(id=self._schemas[name], name=name, encoding="protobuf", data=data))
-        channel = _Channel(len(self._channels) + 1, kind)
-        self._channels[topic] = channel
-        self._chunk.define(
-            Channel(id=channel.id, topic=topic, message_encoding="protobuf", metadata={}, schema_id=self._schemas[name])
-        )
-        return channel
+            self._schemas[name] = definition(Schema(len(self._schemas) + 1, data, "protobuf", name))
+        schema = self._schemas[name]
+        record = Channel(len(self._channels) + 1, topic, "protobuf", {}, schema.record.id)
+        self._channels[topic] = _Channel(record.id, kind, schema, definition(record))
+        return self._channels[topic]
 
     def _close_chunk(self) -> None:
         if self._chunk.size > 0:
@@ -206,4 +206,6 @@ def _words(error: Exception) -> str:
 class _Channel:
     id: int
     kind: type[Proto]
-    count: int = 0
+    schema: Definition
+    record: Definition
+    count: int = 0  # of its messages
