@@ -56,7 +56,7 @@ class Record(NamedTuple):
     sequence: int  # counts the topic's messages from 0 in logs of this program
     data: bytes
     published: int | None = None  # [ns]; None: when it was logged
-    channel: int | None = None  # its channel's id; None: the topic's first channel
+    channel: int = 0  # which of the topic's channels it came by: 0 unless it has several
 
     @property
     def time(self) -> float:
@@ -124,6 +124,7 @@ class LogReader:
         self._attachments: list[Frame] = []
         self._blocks: list[_Block] = []
         self._index_bytes = self._definition_bytes = 0
+        self._by_topic: dict[str, list[int]] = {}  # ids of its channels
         self._decoders: dict[int, Callable[[bytes], Message | Proto]] = {}
         self._unpacked: tuple[int, Buffer] | None = None  # the chunk that was read last: where, content
         counts = np.zeros(1 << 16, np.int64)
@@ -158,9 +159,13 @@ class LogReader:
         return self.metadata.get(RECOVERED, {}).get("damage", "")
 
     @property
-    def definitions(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
-        """Schemas and channels by id."""
-        return self._schemas, self._channels
+    def schemas(self) -> dict[int, Schema]:
+        """By id."""
+        return self._schemas
+
+    def channels(self, topic: str) -> list[Channel]:
+        """A topic's channels, in the order of Record.channel."""
+        return [self._channels[id] for id in self._by_topic[topic]]
 
     def records(
         self, topics: Iterable[str] | None = None, start: float = -np.inf, end: float = np.inf
@@ -169,7 +174,7 @@ class LogReader:
         names = self.topics.keys() if topics is None else set(topics)
         for name in names - self.topics.keys():
             raise ConfigError(f"{self.path} has no topic {name}")
-        wanted = {channel.id for channel in self._channels.values() if channel.topic in names}
+        wanted = {id for name in names for id in self._by_topic[name]}
         return self._select(wanted, start, end)
 
     def messages(
@@ -214,15 +219,13 @@ class LogReader:
             for first, end in zip(starts, [*starts[1:], len(rows)]):
                 whens.setdefault(int(channels[first]), []).append(when[first:end])
                 numbers.setdefault(int(channels[first]), []).append(number[first:end])
-        ids: dict[str, list[int]] = {topic: [] for topic in self.topics}
-        for channel in self._channels.values():
-            ids[channel.topic] += [channel.id] if channel.id in whens else []
+        found = {topic: [id for id in ids if id in whens] for topic, ids in self._by_topic.items()}
         return {
             topic: (
-                np.concatenate([np.empty(0, np.uint64), *(part for id in some for part in whens[id])]),
-                np.concatenate([np.empty(0, np.uint32), *(part for id in some for part in numbers[id])]),
+                np.concatenate([np.empty(0, np.uint64), *(part for id in ids for part in whens[id])]),
+                np.concatenate([np.empty(0, np.uint32), *(part for id in ids for part in numbers[id])]),
             )
-            for topic, some in ids.items()
+            for topic, ids in found.items()
         }
 
     def load_attachments(self) -> Iterator[Attachment]:
@@ -256,6 +259,7 @@ class LogReader:
             known = self._schemas.get(channel.schema_id)
             name = known.name if known else ""
             topic = topics.setdefault(channel.topic, Topic(name))
+            self._by_topic.setdefault(channel.topic, []).append(channel.id)
             if name not in topic.schema.split(", "):
                 topic.schema = f"{topic.schema}, {name}"
             if count := int(self._counts[channel.id]):
@@ -284,7 +288,7 @@ class LogReader:
         return self._unpacked[1]
 
     def _select(self, wanted: set[int], start: float, end: float) -> Iterator[Record]:
-        topics = {id: channel.topic for id, channel in self._channels.items()}
+        names = {id: (topic, k) for topic, ids in self._by_topic.items() for k, id in enumerate(ids)}
         bounded = start > -np.inf or end < np.inf
         for block in self._blocks:
             if block.first / NANO > end or block.last / NANO < start or wanted.isdisjoint(block.channels):
@@ -300,12 +304,11 @@ class LogReader:
                 if bounded and not start <= when / NANO <= end:
                     continue
                 data = content[position + _DATA : position + mcap_records.HEAD.size + length]
-                yield Record(topics[channel], when, sequence, data, published, channel)
+                topic, k = names[channel]
+                yield Record(topic, when, sequence, data, published, k)
 
     def _decoder(self, record: Record) -> Callable[[bytes], Message | Proto]:
-        id = record.channel
-        if id is None:
-            id = next(channel.id for channel in self._channels.values() if channel.topic == record.topic)
+        id = self._by_topic[record.topic][record.channel]
         if id not in self._decoders:
             channel = self._channels[id]
             schema = self._schemas.get(channel.schema_id)
@@ -325,7 +328,7 @@ class _Attachments(Mapping[str, Attachment]):
 
     def __init__(self, log: LogReader):
         self._log = log
-        heads = (mcap_records.attachment(log._data, record, load=False) for record in log._attachments)
+        heads = (mcap_records.attachment_to(log._data, record, load=False)[0] for record in log._attachments)
         self._records = {head.name: record for head, record in zip(heads, log._attachments)}
 
     def __getitem__(self, name: str) -> Attachment:
@@ -393,31 +396,43 @@ class _Pass:
             _, size = _INDEX.unpack_from(self.data, record.start)
             if record.end - record.start < _INDEX.size + size:
                 raise Unsound
+            self._check_end(record, record.start + _INDEX.size + size, limit)
             self.in_hurt_chunks += size // 16 if self.counting else 0
             return record.end
         self.counting = False
         if opcode == Opcode.CHUNK:
-            self._take_chunk(mcap_records.chunk_at(self.data, record))
+            chunk = mcap_records.chunk_at(self.data, record)
+            self._check_end(record, chunk.end, limit)
+            self._take_chunk(chunk)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            definition = mcap_records.parse(self.data, record)
+            definition, used = mcap_records.parse_to(self.data, record)
+            self._check_end(record, used, limit)
             assert isinstance(definition, Schema | Channel)
             if self.data_end is None:
                 self._define(record, definition)
             else:
                 self.summary.append((record, definition))
         elif opcode == Opcode.ATTACHMENT:
-            mcap_records.attachment(self.data, record, load=False)
+            _, used = mcap_records.attachment_to(self.data, record, load=False)
+            self._check_end(record, used, limit)
             log._attachments.append(record)
         elif opcode in _NAMES:
-            self._take_other(record, position)
+            self._take_other(record, position, limit)
         elif log.library == LIBRARY or not self._follows(record.end, limit, 1):
             raise Unsound  # a private record is skipped, but this program writes none
         return record.end
 
-    def _take_other(self, record: Frame, position: int) -> None:
+    def _check_end(self, record: Frame, used: int, limit: int) -> None:
+        """Bytes behind a record's fields may be there, unless they are of a record whose length is damaged."""
+        if used != record.end and (self.log.library == LIBRARY or not self._follows(record.end, limit, 1)):
+            raise Unsound
+
+    def _take_other(self, record: Frame, position: int, limit: int) -> None:
         if record.opcode not in _PARSED:
             return
-        match mcap_records.parse(self.data, record):
+        parsed, used = mcap_records.parse_to(self.data, record)
+        self._check_end(record, used, limit)
+        match parsed:
             case Header() as header:
                 self.log._header = self.log._header or header
             case Metadata() as metadata:
@@ -515,7 +530,7 @@ class _Pass:
                 if record.opcode == Opcode.CHUNK:
                     mcap_records.unpacked(self.data, mcap_records.chunk_at(self.data, record))
                 elif record.opcode == Opcode.ATTACHMENT:
-                    mcap_records.attachment(self.data, record, load=False)
+                    mcap_records.attachment_to(self.data, record, load=False)
                 elif record.opcode == Opcode.DATA_END and record.end - record.start != 4:
                     continue
                 elif record.opcode in _ALWAYS:

@@ -70,8 +70,17 @@ def frame(data: Buffer, position: int, limit: int) -> Frame:
 
 def parse(data: Buffer, record: Frame) -> McapRecord:
     """A header, schema, channel, metadata, statistics, end of data or footer."""
-    f = _Fields(data, record.start, record.end)
-    match record.opcode:
+    return parse_to(data, record)[0]
+
+
+def parse_to(data: Buffer, record: Frame) -> tuple[McapRecord, int]:
+    """As `parse`, and where its last field ends."""
+    fields = _Fields(data, record.start, record.end)
+    return _parse(record.opcode, fields), fields.position
+
+
+def _parse(opcode: int, f: "_Fields") -> McapRecord:
+    match opcode:
         case Opcode.HEADER:
             return Header(profile=f.text(), library=f.text())
         case Opcode.SCHEMA:
@@ -88,6 +97,7 @@ def parse(data: Buffer, record: Frame) -> McapRecord:
             return Metadata(name=f.text(), metadata=f.texts())
         case Opcode.STATISTICS:
             counts = {name: f.number(size) for name, size in _STATISTICS.items()}
+            f.skip(f.number(4))  # messages by channel: the messages say it themselves
             return Statistics(channel_message_counts={}, **counts)
         case Opcode.DATA_END:
             return DataEnd(data_section_crc=f.number(4))
@@ -100,15 +110,20 @@ _STATISTICS = {"message_count": 8, "schema_count": 2, "channel_count": 4, "attac
 _STATISTICS |= {"metadata_count": 4, "chunk_count": 4, "message_start_time": 8, "message_end_time": 8}
 
 
-def attachment(data: Buffer, record: Frame, load: bool = True) -> Attachment:
-    """An attachment whose CRC matches; without its data unless `load`."""
+def attachment(data: Buffer, record: Frame) -> Attachment:
+    """An attachment whose CRC matches."""
+    return attachment_to(data, record)[0]
+
+
+def attachment_to(data: Buffer, record: Frame, load: bool = True) -> tuple[Attachment, int]:
+    """As `attachment`, and where its last field ends; without its data unless `load`."""
     f = _Fields(data, record.start, record.end)
     log_time, create_time, name, media_type = f.number(8), f.number(8), f.text(), f.text()
     start, end = f.skip(f.number(8))
     if f.number(4) not in (0, crc(data, record.start, end)):
         raise Unsound
     content = data[start:end] if load else b""
-    return Attachment(create_time=create_time, log_time=log_time, name=name, media_type=media_type, data=content)
+    return Attachment(create_time, log_time, name, media_type, content), f.position
 
 
 def chunk_at(data: Buffer, record: Frame) -> ChunkAt:
@@ -223,15 +238,15 @@ class _Fields:
     """Reads a record's fields one after the other."""
 
     def __init__(self, data: Buffer, position: int, end: int):
-        self._data, self._position, self._end = data, position, end
+        self._data, self.position, self._end = data, position, end
 
     def skip(self, size: int) -> tuple[int, int]:
         """Where a field of this size begins and ends."""
-        start = self._position
+        start = self.position
         if size > self._end - start:
             raise Unsound
-        self._position = start + size
-        return start, self._position
+        self.position = start + size
+        return start, self.position
 
     def blob(self, size: int) -> bytes:
         start, end = self.skip(size)
@@ -248,7 +263,7 @@ class _Fields:
         start, end = self.skip(self.number(4))
         inner = _Fields(self._data, start, end)
         out = {}
-        while inner._position < end:
+        while inner.position < end:
             key = inner.text()
             out[key] = inner.text()
         return out

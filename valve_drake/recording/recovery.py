@@ -40,15 +40,16 @@ def copy(log: LogReader, file: IO[bytes]) -> None:
     """Writes all that could be read of a log as a new MCAP file."""
     library = LIBRARY if log.library is None else log.library
     mcap, chunk = McapFile(file, library, log.profile), Chunk()
-    definitions = _definitions(log)
     for part in log.load_attachments():
         mcap.add_attachment(part)
-    chunk.define(*(one for pair in definitions.values() for one in pair))  # those of channels without messages, too
+    definitions = {topic: [_both(log, channel) for channel in log.channels(topic)] for topic in log.topics}
+    chunk.define(
+        *(one for pairs in definitions.values() for pair in pairs for one in pair)
+    )  # those without messages, too
     for record in log.records():
-        assert record.channel is not None
-        if record.channel not in chunk.index:
-            chunk.define(*definitions[record.channel])
-        chunk.add(record.channel, record.when, record.sequence, record.data, record.published)
+        both = definitions[record.topic][record.channel]
+        chunk.define(*both)
+        chunk.add(both[-1].record.id, record.when, record.sequence, record.data, record.published)
         if chunk.size > CHUNK_SIZE:
             mcap.add_chunk(chunk)
             chunk = Chunk()
@@ -62,14 +63,8 @@ def copy(log: LogReader, file: IO[bytes]) -> None:
     mcap.finish()
 
 
-def _definitions(log: LogReader) -> dict[int, tuple[Definition, ...]]:
-    """Channel -> its schema, if it has one, and the channel itself."""
-    schemas, channels = log.definitions
-    made = {id: definition(schema) for id, schema in schemas.items()}
-
-    def both(channel: Channel) -> tuple[Definition, ...]:
-        if channel.schema_id in made:
-            return made[channel.schema_id], definition(channel)
-        return (definition(dc.replace(channel, schema_id=0)),)  # a reader must find each schema that is named
-
-    return {id: both(channel) for id, channel in channels.items()}
+def _both(log: LogReader, channel: Channel) -> tuple[Definition, ...]:
+    """A channel's schema, if it has one, and the channel."""
+    if channel.schema_id in log.schemas:
+        return definition(log.schemas[channel.schema_id]), definition(channel)
+    return (definition(dc.replace(channel, schema_id=0)),)  # a reader must find each schema that is named
