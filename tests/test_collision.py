@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from robot_facts import ARMS_HOME as HOME
 
 from valve_drake.behaviors.grasp_geometry import StanceConfig, best_arc, find_stance, hand_in_valve, standoff, turned
 from valve_drake.collision import CollisionModel
@@ -13,8 +14,6 @@ from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
 
 MARKER = Marker()
-LEFT_HOME = np.array([1.05, 0.65, -1.9, 0.0, 1.25, 0.0])
-HOME = np.concatenate([LEFT_HOME, LEFT_HOME * [1, -1, -1, -1, -1, -1]])
 ON_BAR = (0.0, 0.03, 0.0)  # off the handle, in the hand: a finger touches the bar [m]
 STRAIGHT = dict.fromkeys(SIDES, np.array([0.0, 0, 1]))
 

@@ -5,6 +5,7 @@ import dataclasses as dc
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+from robot_facts import HOME, arm
 
 from valve_drake.checks import ConfigError
 from valve_drake.messages import Command, Health, Mode, ModeState, RobotState, SelectorReport, Verdict
@@ -27,8 +28,6 @@ from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
 DT = 1 / 128
 CONFIG = CommandSelectorConfig()
 INITIAL = {port: np.full(size, 0.01) for port, size in PORTS.items()}
-HOME = np.array([1.05, 0.65, -1.9, 0.0, 1.25, 0.0])
-MIRROR = np.array([1, -1, -1, -1, -1, -1])
 BOUNDS = bounds(CONFIG)
 
 
@@ -38,7 +37,7 @@ def command(time: float, **groups) -> Command:
         "base_twist": np.array([0.1, 0.2]),
         "torso": np.array([0.1, 0.2, 0.3]),
         "left_arm": HOME,
-        "right_arm": HOME * MIRROR,
+        "right_arm": arm("right", HOME),
         "left_gripper": np.array([0.05, 30.0]),
         "right_gripper": np.array([0.05, 30.0]),
     }
@@ -55,7 +54,7 @@ class Bench:
         self.mode = ModeState(mode=mode.value, activation=1)
         self.health = Health()
         self.robot = RobotState(
-            torso=np.zeros(3), left_arm=HOME, right_arm=HOME * MIRROR, history=np.zeros((1, 7)), left_gripper=0.02
+            torso=np.zeros(3), left_arm=HOME, right_arm=arm("right", HOME), history=np.zeros((1, 7)), left_gripper=0.02
         )
         self.robot_age = self.mode_age = self.command_age = 0.0
 
@@ -388,7 +387,7 @@ def test_a_silent_device_holds_its_group_and_one_silent_arm_holds_both():
         bench.tick()
         bench.health = Health(devices=("base", device), ages=np.array([0.0, CONFIG.max_age + 0.01]))
         before = {port: bench.out(port) for port in PORTS}
-        report = bench.tick(left_arm=HOME + 0.1, right_arm=HOME * MIRROR + 0.1)
+        report = bench.tick(left_arm=HOME + 0.1, right_arm=arm("right", HOME) + 0.1)
         assert {group for group, source in zip(GROUPS, report.source) if source == "hold"} == held | {"base"}
         assert f"{device} silent" in " ".join(report.refused)
         for group in held:
@@ -505,7 +504,7 @@ def test_follow_lands_exactly_for_periods_that_are_no_power_of_two():
 
 
 def rig(**inputs) -> Rig:
-    robot = RobotState(left_arm=HOME, right_arm=HOME * MIRROR, history=np.zeros((1, 7)))
+    robot = RobotState(left_arm=HOME, right_arm=arm("right", HOME), history=np.zeros((1, 7)))
     fixed = {"mode": ModeState(mode="reach", activation=1), "robot_state": robot, "health": Health()}
     return Rig(CommandSelectorSystem(CONFIG, INITIAL), **fixed | inputs)
 

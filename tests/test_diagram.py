@@ -100,10 +100,3 @@ def test_imports_point_one_way(path):
     if part != "commands" and str(name) not in ("runner.py", "cli.py", "__main__.py", "teaching.py", "drawing.py"):
         assert not any(i in ("valve_drake.cli", "valve_drake.runner") for i in imports)
     assert "valve_drake.stations.simulated" not in imports or str(name) in ("diagram.py", "teaching.py")
-
-
-def test_nothing_that_controls_reads_the_truth():
-    for path in MODULES:
-        part = path.relative_to(PACKAGE).parts[0]
-        if part in ("behaviors", "perception", "supervisor", "camera"):
-            assert "truth" not in path.read_text().lower(), path

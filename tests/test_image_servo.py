@@ -5,6 +5,7 @@ import dataclasses as dc
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+from robot_facts import AT_VALVE, arm
 
 from valve_drake.behaviors.image_servo import ImageServo, ImageServoConfig, Memory
 from valve_drake.behaviors.image_servo_system import ImageServoSystem
@@ -18,10 +19,8 @@ DT = 1 / 64  # half the real rate: the law does not depend on it, and the tests 
 IMAGE = 4  # ticks between images
 CONFIG = ImageServoConfig()
 SERVO = ModeState(mode=Mode.SERVO.value, activation=3)
-AT_HANDLE = np.array([0.11, 0.72, -1.73, 0.13, 1.01, -0.07])  # left arm; mirrored on the right
-MIRROR = np.array([1, -1, -1, -1, -1, -1])
 MARK = np.array([[-20, -11, 0], [20, -11, 0], [20, 11, 0], [-20, 11, 0]]) * 1e-3  # corners, in the mark
-Q_REF = {side: AT_HANDLE if side == "left" else AT_HANDLE * MIRROR for side in SIDES}
+Q_REF = {side: arm(side, AT_VALVE) for side in SIDES}
 X_REF = {side: GEOMETRY.arm_forward(Q_REF[side], side) for side in SIDES}  # hands on their handles
 
 
@@ -305,7 +304,7 @@ def test_a_joint_at_its_limit_never_swings_round():
     """J4 may leave its range only by a whole turn of the wrist: the hand stays instead."""
     law = Bench(13).law
     q = np.array([1.05, 0.65, -1.9, 3.31, 1.25, 0.0])
-    arms = {"left": q, "right": q * MIRROR}
+    arms = {side: arm(side, q) for side in SIDES}
     X = GEOMETRY.arm_forward(q, "left")
     J = GEOMETRY.arm_jacobian(q, "left")
     up = np.linalg.inv(J)[3, 3:]  # the hand's direction that turns J4 most

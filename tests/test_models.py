@@ -23,11 +23,10 @@ from pydrake.multibody.tree import WeldJoint
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
+from robot_facts import AT_VALVE, HOME, arm
 
 MODELS = Path(__file__).parents[1] / "models"
 SIDES = {"left": 1, "right": -1}
-HOME = np.array([1.05, 0.65, -1.9, 0.0, 1.25, 0.0])  # left; the right arm's joints 2, 3 and 5 mirror
-MIRROR = np.array([1, -1, -1, 1, -1, 1])
 TRUNK = ["base_x", "base_y", "base_yaw", "waist", "neck_yaw", "neck_pitch"]
 ARMS = [f"{side}_arm_{k}" for side in SIDES for k in range(1, 7)]
 
@@ -81,7 +80,7 @@ class World:
 
     def set_arms(self, left):
         for side in SIDES:
-            for k, q in enumerate(left if side == "left" else left * MIRROR):
+            for k, q in enumerate(arm(side, left)):
                 self.set(f"{side}_arm_{k + 1}", q)
 
     def touching(self):
@@ -157,7 +156,7 @@ def test_trunk_limits_and_servos(robot):
     assert robot.joint("neck_pitch").position_lower_limits() == -0.5
 
 
-@pytest.mark.parametrize("arms", [HOME, np.array([0.13, 0.8, -1.94, 0.14, 1.14, -0.06])], ids=["home", "at the valve"])
+@pytest.mark.parametrize("arms", [HOME, AT_VALVE], ids=["home", "at the valve"])
 def test_arm_servos_are_well_damped(robot, arms):
     robot.set_arms(arms)
     M = robot.plant.CalcMassMatrix(robot.context)
@@ -235,12 +234,16 @@ def test_masses(robot):
     assert robot.plant.GetBodyByName("base").CalcCenterOfMassInBodyFrame(robot.context)[2] < 0.25
 
 
-def test_arms_are_mirror_images(robot):
-    robot.set_arms(HOME)
+@pytest.mark.parametrize("arms", [HOME, AT_VALVE, np.array([0.4, -0.3, -1.2, 0.9, -0.7, 1.1])])
+def test_arms_are_mirror_images(robot, arms):
+    robot.set_arms(arms)
     X_left, X_right = robot.pose("left_grip"), robot.pose("right_grip")
-    across = np.array([1, -1, 1])
-    assert X_right[:3, 3] == pytest.approx(across * X_left[:3, 3], abs=1e-12)
-    assert X_right[:3, 2] == pytest.approx(across * X_left[:3, 2], abs=1e-12)
+    across = np.diag([1, -1, 1])  # the plane y = 0; a hand's own mirror image has its x axis turned round
+    assert X_right[:3, 3] == pytest.approx(across @ X_left[:3, 3], abs=1e-12)
+    assert X_right[:3, :3] == pytest.approx(across @ X_left[:3, :3] @ np.diag([-1, 1, 1]), abs=1e-12)
+
+
+def test_arms_weigh_alike(robot):
     left, right = ([robot.plant.GetBodyByName(f"{side}_{name}").default_spatial_inertia().CopyToFullMatrix6()
                     for name in ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3", "finger_1_link")]
                    for side in SIDES)  # fmt: skip

@@ -4,7 +4,6 @@ import itertools
 import json
 import re
 import shutil
-import time
 from pathlib import Path
 
 import numpy as np
@@ -161,10 +160,8 @@ def test_a_run_cannot_be_made_on_the_replay_station(tmp_path, capsys):
 # ---- the whole
 
 
-def test_an_unchanged_program_makes_every_message_again_to_the_bit_and_faster_than_real_time(log):
-    begin = time.process_time()
+def test_an_unchanged_program_makes_every_message_again_to_the_bit(log):
     result = runner.replay(log)
-    assert time.process_time() - begin < 3.0  # the clock on the wall would measure other programs too
     assert result.comparison.identical and result.comparison.first is None
     assert result.as_json()["first_divergence"] is None and result.as_json()["max_difference"] == 0.0
     assert result.end == log.end == 3.0

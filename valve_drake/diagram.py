@@ -26,7 +26,7 @@ from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, make
-from valve_drake.kinematics import GEOMETRY
+from valve_drake.kinematics import GEOMETRY, both_arms
 from valve_drake.messages import SIDES, OperatorCommand
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
 from valve_drake.perception.handle_marker_system import HandleMarkerSystem
@@ -103,8 +103,7 @@ class System:
 
 def home(scenario: Scenario) -> np.ndarray:
     """Both arms at home (12,)."""
-    arm = np.array(scenario.kinematic_approach.home)
-    return np.concatenate([arm, arm * np.array([1, -1, -1, -1, -1, -1])])
+    return both_arms(np.array(scenario.kinematic_approach.home))
 
 
 def initial_commands(scenario: Scenario) -> dict[str, np.ndarray]:

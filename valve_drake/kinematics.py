@@ -22,6 +22,7 @@ from valve_drake.frames import compose, cross, make, planar, rot_x, rot_y, rot_z
 from valve_drake.messages import LEFT, RIGHT
 
 ARM_LIMITS = np.array([2.97, 2.09, 2.62, 3.32, 2.09, 3.14])  # +- [rad]
+MIRROR = np.array([1.0, -1, -1, -1, -1, -1])  # left arm to right arm: all axes but the lateral J1 change sign
 R_G0 = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # R_HG at zero: x_G = y_H, y_G = z_H, z_G = x_H
 
 
@@ -151,6 +152,11 @@ class RobotGeometry:
             *((ARM_LIMITS - np.abs(q)) / np.deg2rad(40)),
         ]
         return float(min(1.0, *parts))
+
+
+def both_arms(left: np.ndarray) -> np.ndarray:
+    """A pose of the left arm (6,) and its mirror image on the right -> (12,)."""
+    return np.concatenate([left, left * MIRROR])
 
 
 def lateral(side: str) -> float:

@@ -28,7 +28,7 @@ from valve_drake.behaviors.grasp_geometry import (
 from valve_drake.behaviors.joint_path import Path, find_path
 from valve_drake.checks import require, require_positive
 from valve_drake.frames import compose, inverse, planar, wrap
-from valve_drake.kinematics import ARM_LIMITS, RobotGeometry, lateral
+from valve_drake.kinematics import ARM_LIMITS, RobotGeometry, both_arms, lateral
 from valve_drake.messages import (
     LEFT,
     RIGHT,
@@ -127,8 +127,7 @@ class KinematicApproach:
         self.view = view
         self.reference_area = reference_area
         self.is_free = is_free
-        home = np.array(config.home)
-        self.home = np.concatenate([home, home * np.array([1, -1, -1, -1, -1, -1])])
+        self.home = both_arms(np.array(config.home))
 
     # ------------------------------------------------------------ the step
     def step(
