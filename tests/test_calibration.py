@@ -14,7 +14,7 @@ import yaml
 from valve_drake import frames
 from valve_drake.camera import calibration as cal
 from valve_drake.camera import hand_eye
-from valve_drake.camera.board import Board, find_corners, find_images, natural, parse_board
+from valve_drake.camera.board import Board, find_corners, find_images, natural, pair_images, parse_board
 from valve_drake.camera.calibration_file import load_calibration, save_camera
 from valve_drake.camera.lens import Lens, OpenCvLens, StereoHead, load_head, save_head
 from valve_drake.checks import ConfigError
@@ -86,6 +86,90 @@ def test_names_are_paired_by_their_numbers(tmp_path):
         (tmp_path / name).write_bytes(b"")
     found = [path.name for path in find_images([str(tmp_path / "*.png")], "--images")]
     assert found == ["a_10.png", "b_9cm.png", "b_60cm.png", "b_120cm.png"] == sorted(names, key=natural)
+
+
+def touch(folder: pathlib.Path, *names: str) -> list[pathlib.Path]:
+    folder.mkdir(exist_ok=True, parents=True)
+    for name in names:
+        (folder / name).write_bytes(b"")
+    return [folder / name for name in names]
+
+
+def test_a_name_that_exists_is_taken_as_it_is_and_one_that_does_not_is_refused(tmp_path):
+    odd = touch(tmp_path, "r [1].png", "r [2].png", "a*.png", "ab.png")
+    inside = touch(tmp_path / "set [left]", "1.png", "2.png")
+    assert set(find_images([str(path) for path in odd[:3]], "--images")) == set(odd[:3])
+    assert find_images([str(tmp_path / "set [left]" / "*.png")], "--images") == inside
+    assert find_images([str(tmp_path / "r*.png")], "--images") == odd[:2]
+    for names in (("none.png",), ("none*.png",), ("ab.png", "none.png"), ("ab.png", "none*.png"), ("a\0b",), (".",)):
+        with pytest.raises(ConfigError, match=r"--images '.*': no such image") as error:
+            find_images([str(tmp_path / name) for name in names], "--images")
+        assert "\n" not in str(error.value)
+
+
+def names_of(pairs) -> list[tuple[str, str]]:
+    return [(a.name, b.name) for a, b in pairs.paths]
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "paired", "alone"),
+    [
+        (["l1", "l2", "l3", "l5"], ["r1", "r2", "r3", "r4"], 3, ["l5", "r4"]),
+        (["cam1_8", "cam1_9", "cam1_10"], ["cam2_8", "cam2_9", "cam2_10"], 3, []),
+        (["camera_1_60cm", "camera_1_70cm"], ["camera_2_60cm", "camera_2_70cm"], 2, []),
+        (["l01", "l02", "l03"], ["r1", "r2", "r3"], 3, []),
+        (["a", "b", "c"], ["a", "b", "c"], 3, []),
+    ],
+)
+def test_pairs_are_made_by_the_numbers_in_the_names(tmp_path, left, right, paired, alone):
+    sides = [touch(tmp_path / side, *names) for side, names in (("left", left), ("right", right))]
+    pairs = pair_images(*sides)
+    assert len(pairs.paths) == paired and [path.name for path in pairs.alone] == alone and not pairs.by_order
+    assert all(natural(a.name)[-1] == natural(b.name)[-1] or int(a.name[1:]) == int(b.name[1:]) for a, b in pairs.paths)
+
+
+def test_names_that_tell_no_pairs_are_taken_in_order_and_said_so(tmp_path):
+    left, right = touch(tmp_path, "a_17", "a_21"), touch(tmp_path, "b_18", "b_22")
+    pairs = pair_images(left, right)
+    assert names_of(pairs) == [("a_17", "b_18"), ("a_21", "b_22")] and pairs.by_order
+    with pytest.raises(ConfigError, match="must pair up"):
+        pair_images(left, right[:1])
+    # Images of one name each, in folders that tell them apart.
+    left, right = ([touch(tmp_path / f"set{k}", f"{side}.png")[0] for k in (8, 9, 10)] for side in ("left", "right"))
+    assert [a.parent == b.parent for a, b in pair_images(left, right[1:] + right[:1]).paths] == [True] * 3
+
+
+@pytest.mark.parametrize("scale", [1, 2.2])
+@pytest.mark.parametrize("noise", [1.0, 4.0])
+def test_corners_of_a_large_noisy_image_are_found_in_a_reduced_one_and_refined_in_it(scale, noise, monkeypatch):
+    searched = []
+    for name in ("findChessboardCorners", "findChessboardCornersSB"):
+        find = getattr(cv2, name)
+        monkeypatch.setattr(
+            cv2, name, lambda image, *a, find=find, **b: (searched.append(max(image.shape)), find(image, *a, **b))[1]
+        )
+    lens = dc.replace(PAPER, k_u=5e-8, k_v=5e-8, k_x=2000, k_y=1990, u_0=1310, v_0=960, width=2600, height=1950)
+    X_CT = frames.make(frames.rotation(np.array([0.3, -0.25, 0.2])), np.array([0.02, 0.0, 0.45 * scale]))
+    image = cv2.GaussianBlur(boards.draw(lens, X_CT, BOARD, 1), (0, 0), 2.0).astype(float)
+    image = (image + np.random.default_rng(4).normal(0, noise, image.shape)).clip(0, 255).round().astype(np.uint8)
+    error = find_corners(image, BOARD) - boards.corners(lens, X_CT, BOARD.points())
+    assert np.sqrt((error**2).sum(1).mean()) < 0.1 and max(searched) == 1300
+
+
+def test_pure_noise_is_given_up_without_the_search_that_takes_minutes(monkeypatch):
+    quick, find = [], cv2.findChessboardCorners
+    monkeypatch.setattr(
+        cv2, "findChessboardCorners", lambda image, *a, **b: (quick.append(image.shape), find(image, *a, **b))[1]
+    )
+    assert find_corners(np.random.default_rng(5).integers(0, 256, (1500, 2000)).astype(np.uint8), BOARD) is None
+    assert quick == [(975, 1300)]
+
+
+def test_a_defocused_board_is_refined_with_a_window_that_holds_its_blurred_edges():
+    X_CT = frames.make(frames.rotation(np.array([0.3, -0.25, 0.2])), np.array([0.02, 0.0, 0.3]))
+    image = cv2.GaussianBlur(boards.draw(PAPER, X_CT, BOARD, 2), (0, 0), 3.0)
+    error = find_corners(image, BOARD) - boards.corners(PAPER, X_CT, BOARD.points())
+    assert np.sqrt((error**2).sum(1).mean()) < 0.1
 
 
 @pytest.mark.parametrize(
@@ -173,6 +257,34 @@ def test_a_pair_that_moved_between_the_exposures_is_an_outlier():
     seen[4] = dc.replace(seen[4], px=(seen[4].px[0], seen[4].px[1] + [0, 3.0]))
     fit = cal.calibrate(seen, SIZE, "paper").fit
     assert 4 in fit.outliers() and int(np.argmax(fit.view_rms().sum(1))) == 4 and len(fit.outliers()) < 4
+
+
+@pytest.mark.parametrize("shape", [(8, 6), (6, 6)])
+def test_a_symmetric_board_is_numbered_alike_in_both_images(shape):
+    board = Board(*shape, 0.025, 0.025)
+    poses = boards.tilted(9, np.random.default_rng(41), 0.5)
+    truth = views((PAPER, PAPER), poses, 0.1, 42, points=[board.points()] * 9)
+    turned = [
+        dc.replace(view, px=(view.px[0], board.turned(view.px[1], board.turns()[k % len(board.turns())])))
+        for k, view in enumerate(truth)
+    ]
+    assert any(np.abs(a.px[1] - b.px[1]).max() > 10 for a, b in zip(truth, turned))
+    result = cal.calibrate(turned, SIZE, "paper", board)
+    assert result.fit.rms == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+    np.testing.assert_allclose(result.fit.X_LR[:, 3], X_LR[:, 3], atol=1e-3)
+    for view, true in zip(result.views, truth):
+        np.testing.assert_array_equal(view.px[1], true.px[1])
+
+
+def test_pairs_of_other_moments_are_said_to_be_no_pairs_and_not_a_vague_focal_length():
+    seen = views((PAPER, PAPER), boards.tilted(8, np.random.default_rng(43), 0.45), 0.1, 44)
+    others = [dc.replace(view, px=(view.px[0], seen[k - 1].px[1])) for k, view in enumerate(seen)]
+    with pytest.raises(ConfigError, match="pairs do not fit one another") as error:
+        cal.calibrate(others, SIZE)
+    assert "focal" not in str(error.value) and "no two" in str(error.value)
+    two = others[:2] + seen[2:]
+    with pytest.raises(ConfigError, match="look at 0 with 0, 1 with 1;"):
+        cal.calibrate(two, SIZE)
 
 
 FRONTAL = [frames.make(frames.rot_z(0.02 * k), np.array([0.02, -0.01, 0.5 + 0.1 * k])) for k in range(7)]

@@ -33,6 +33,8 @@ _MAX_FOCAL_SIGMA = 0.02  # a focal length known less well than this (relative) i
 _MIN_TILT = 8.0  # of the steepest board, and between two: less does not tell the focal length from distance [deg]
 _TILT = "tilt it by up to 45 deg to all sides, or give --distances"
 _OUTLIER = 2.5  # times the median view's rms
+_APART = 0.15  # turn [rad] plus shift over the boards' distance by which pairs put the right camera elsewhere
+_MISFIT = 10.0  # rms of both cameras over that of each alone, beyond which the pairs are none
 
 
 @dc.dataclass(frozen=True)
@@ -268,13 +270,15 @@ def calibrate(
     # Boards that are all frontal show little of a lens: what they cannot tell must not be fitted.
     kinds = {"opencv": _OpenCvKind([0] if rigid else range(5)), "paper": _PaperKind()}
     fits = {}
-    start = _start(views, size, kinds["opencv"], rigid)
+    start = _start(views, size, kinds["opencv"], rigid, board)
+    views = start.views
     for name, model in kinds.items():
-        lenses = tuple(model.start(K, dist) for K, dist in start[0])
+        lenses = tuple(model.start(K, dist) for K, dist in start.lenses)
         try:
-            fits[name] = _solve(views, model, name, _State(lenses, *start[1:]), size)
+            fits[name] = _solve(views, model, name, _State(lenses, start.X_LR, start.poses), size)
         except np.linalg.LinAlgError as error:
             raise ConfigError(f"degenerate: the boards do not determine a camera: {_TILT}") from error
+    _refuse_misfits(fits["opencv"], start)
     _refuse_vague(fits["opencv"], rigid)
     better = min(fits, key=lambda name: _information(fits[name]))
     fit = fits[better if kind == "best" else kind]
@@ -292,10 +296,19 @@ def calibrate(
     )
 
 
-def _start(
-    views: Sequence[View], size: tuple[int, int], kind: _OpenCvKind, rigid: bool
-) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray | None, tuple[np.ndarray, ...]]:
-    """OpenCV's answer for each camera alone, then for both -> (K, dist) of each, X_LR, X_LT of each body."""
+@dc.dataclass(frozen=True)
+class _Start:
+    """OpenCV's answer for each camera alone, and what follows for both."""
+
+    views: tuple[View, ...]  # numbered so that the cameras agree
+    lenses: list[tuple[np.ndarray, np.ndarray]]  # (K, dist) of each camera
+    X_LR: np.ndarray | None
+    poses: tuple[np.ndarray, ...]  # X_LT of each body
+    rms: float  # over all corners, each camera alone [px]
+    misfits: list[tuple[str, ...]]  # names of the pairs that put the right camera elsewhere than most do
+
+
+def _start(views: Sequence[View], size: tuple[int, int], kind: _OpenCvKind, rigid: bool, board: Board | None) -> _Start:
     groups = [[view for view in views if view.body == b] for b in range(views[-1].body + 1)]
     points = [np.vstack([view.points for view in group]).astype(np.float32) for group in groups]
     flags = 0
@@ -324,18 +337,53 @@ def _start(
             raise ConfigError(f"degenerate: the boards do not determine a camera: {_TILT}")
         if not rigid:
             _refuse_frontal([cv2.Rodrigues(rvec)[0][:, 2] for rvec in best[3]])
-        alone.append((best[1], best[2].ravel(), best[3], best[4]))
+        alone.append((best[1], best[2].ravel(), best[3], best[4], best[0]))
         seen.append(px)
-    lenses = [(K, dist) for K, dist, _, _ in alone]
-    poses = tuple(transform(r, t) for r, t in zip(*alone[0][2:]))
+    lenses = [(K, dist) for K, dist, *_ in alone]
+    poses = [tuple(transform(r, t) for r, t in zip(*one[2:4])) for one in alone]
+    rms = math.sqrt(np.mean([one[4] ** 2 for one in alone]))
     if len(alone) == 1:
-        return lenses, None, poses
-    (K0, d0), (K1, d1) = lenses
-    R, t = np.eye(3), np.zeros(3)
-    both = cv2.stereoCalibrateExtended(
-        points, seen[0], seen[1], K0, d0, K1, d1, size, R, t, flags=cv2.CALIB_FIX_INTRINSIC
-    )
-    return lenses, frames.inverse(frames.make(both[5], both[6].ravel())), poses
+        return _Start(tuple(views), lenses, None, poses[0], rms, [])
+    turns = board.turns() if board and not rigid else (0,)
+    X_LR, chosen, off = _one_right_camera(poses[0], poses[1], turns)
+    if board:
+        views = [
+            dc.replace(view, px=(view.px[0], board.turned(view.px[1], chosen[view.body])))
+            if chosen[view.body]
+            else view
+            for view in views
+        ]
+    return _Start(tuple(views), lenses, X_LR, poses[0], rms, [view.names for view in views if off[view.body]])
+
+
+def _one_right_camera(
+    X_LT: Sequence[np.ndarray], X_RT: Sequence[np.ndarray], turns: Sequence[int]
+) -> tuple[np.ndarray, list[int], list[bool]]:
+    """X_LR on which most pairs agree, the quarter turns by which each right board is then numbered, who disagrees.
+
+    A board that looks the same after a turn may have been numbered from another corner in the right image. Each
+    pair and each of its numberings says where the right camera is: the answer is the one nearest to all pairs.
+    """
+
+    def distance(A: np.ndarray, B: np.ndarray, scale: float) -> float:
+        turn = np.linalg.norm(frames.rotation_vector(A[:, :3].T @ B[:, :3]))
+        return float(turn + np.linalg.norm(A[:, 3] - B[:, 3]) / scale)
+
+    scale = float(np.median([np.linalg.norm(X[:, 3]) for X in X_LT]))
+    candidates = []
+    for left, right in zip(X_LT, X_RT):
+        turned = [frames.compose(right, frames.make(frames.rot_z(k * math.pi / 2), np.zeros(3))) for k in turns]
+        candidates.append([frames.compose(left, frames.inverse(X)) for X in turned])
+    best: tuple[float, np.ndarray] | None = None
+    for X in (X for one in candidates for X in one):
+        nearest = [min(distance(X, other, scale) for other in one) for one in candidates]
+        # Where all boards lie alike every numbering fits: then the cameras look alike.
+        cost = float(np.minimum(nearest, _APART).sum()) + 1e-3 * distance(np.eye(3, 4), X, scale)
+        if best is None or cost < best[0]:
+            best = cost, X
+    X_LR = best[1]
+    off = [[distance(X_LR, other, scale) for other in one] for one in candidates]
+    return X_LR, [turns[int(np.argmin(one))] for one in off], [min(one) > _APART for one in off]
 
 
 def _refuse_frontal(normals: Sequence[np.ndarray]) -> None:
@@ -349,6 +397,18 @@ def _refuse_frontal(normals: Sequence[np.ndarray]) -> None:
             f"degenerate: the board {how} in every image (within {min(tilt, between):.0f} deg), so that its "
             f"distance and the focal length cannot be told apart: {_TILT}"
         )
+
+
+def _refuse_misfits(fit: Fit, start: _Start) -> None:
+    """Raises ConfigError where each camera alone fits its corners, but the pairs do not fit one another."""
+    if fit.X_LR is None or fit.rms < 1 + _MISFIT * start.rms:
+        return
+    pairs = ", ".join(" with ".join(names) for names in start.misfits[:6])
+    which = f"look at {pairs}" if 0 < len(start.misfits) <= len(start.views) / 2 else "no two of them agree"
+    raise ConfigError(
+        f"the pairs do not fit one another (rms {fit.rms:.1f} px, each camera alone {start.rms:.2f} px): {which}; "
+        "are they images of one moment, left with left?"
+    )
 
 
 def _refuse_vague(fit: Fit, rigid: bool) -> None:

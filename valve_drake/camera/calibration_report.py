@@ -1,20 +1,25 @@
 """From folders of images to calibrations: what `calibrate` reports as JSON, and as one HTML page."""
 
+import contextlib
 import dataclasses as dc
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from valve_drake import frames
 from valve_drake.camera import calibration as cal
 from valve_drake.camera import calibration_page as pages
-from valve_drake.camera.board import Board, find_corners, find_images, read_images
+from valve_drake.camera.board import Board, Pairs, find_corners, find_images, pair_images
 from valve_drake.camera.calibration_file import save_camera
+from valve_drake.camera.image_file import read_image
 from valve_drake.camera.lens import save_head
 from valve_drake.checks import ConfigError, require
+from valve_drake.console import console
 
 
 @dc.dataclass(frozen=True)
@@ -35,6 +40,7 @@ class Pictures:
     paths: list[tuple[Path, ...]]
     corners: list[tuple[np.ndarray | None, ...]]
     size: tuple[int, int]
+    pairs: Pairs | None = None  # of two cameras
 
     def missed(self) -> list[str]:
         return [p.name for paths, px in zip(self.paths, self.corners) for p, one in zip(paths, px) if one is None]
@@ -58,7 +64,7 @@ def stereo(
     kind: str = "opencv",
     distances: Sequence[float] | None = None,
 ) -> Report:
-    """The stereo head from two globs, paired by the natural order of the names. Writes `out`."""
+    """The stereo head from two globs, paired by the numbers in the names. Writes `out`."""
     pictures = look(board, (left, right), ("--left", "--right"), distances)
     result = calibrated(pictures, board, kind, distances)
     save_head(result.fit.head(), out, _comment(result))
@@ -71,21 +77,47 @@ def stereo(
 def look(
     board: Board, patterns: Sequence[Sequence[str]], keys: Sequence[str], distances: Sequence[float] | None = None
 ) -> Pictures:
-    paths = [find_images(pattern, key) for pattern, key in zip(patterns, keys)]
-    if len(paths) == 2 and len(paths[0]) != len(paths[1]):
-        raise ConfigError(f"{keys[0]} has {len(paths[0])} images, {keys[1]} {len(paths[1])}: they must pair up")
+    """Finds the board in all images of one camera, or of two in pairs. Raises ConfigError naming the file or option."""
+    found = [find_images(pattern, key) for pattern, key in zip(patterns, keys)]
+    pairs = pair_images(*found) if len(found) == 2 else None
+    paths: list[tuple[Path, ...]] = list(pairs.paths) if pairs else [(path,) for path in found[0]]
     if distances is not None:
-        wanted = f"{len(paths[0])} numbers, one for each image"
-        require(len(distances) == len(paths[0]), "--distances", wanted, len(distances))
+        if pairs and pairs.alone:
+            raise ConfigError(f"--distances needs a partner for every image, {_some(pairs.alone)} has none")
+        wanted = f"{len(paths)} numbers, one for each image"
+        require(len(distances) == len(paths), "--distances", wanted, len(distances))
         require(len(set(distances)) > 1, "--distances", "different from one another", list(distances))
-    images = [read_images(one) for one in paths]
-    for one, key in zip(images[1:], keys[1:]):
-        if one[0].shape != images[0][0].shape:
-            raise ConfigError(f"{key}: images of {one[0].shape[1]} x {one[0].shape[0]}, unlike those of {keys[0]}")
-    corners = [tuple(find_corners(image, board) for image in pair) for pair in zip(*images)]
+    corners, size = _corners(paths, board)
     if not any(all(px is not None for px in pair) for pair in corners):
         raise ConfigError(f"no board of {board.columns} x {board.rows} inner corners in any of {len(corners)} image(s)")
-    return Pictures(list(zip(*paths)), corners, images[0][0].shape[::-1])
+    return Pictures(paths, corners, size, pairs)
+
+
+def _corners(
+    paths: Sequence[tuple[Path, ...]], board: Board
+) -> tuple[list[tuple[np.ndarray | None, ...]], tuple[int, int]]:
+    """The corners in every image, and the size that all images have. One image at a time is held in memory."""
+    corners, first = [], None
+    with console(stderr=True).status("") if sys.stderr.isatty() else contextlib.nullcontext() as status:
+        for k, pair in enumerate(paths):
+            px = []
+            for path in pair:
+                if status is not None:
+                    status.update(f"looking for the board in {path.name} ({k + 1} of {len(paths)})")
+                image = read_image(path, cv2.IMREAD_GRAYSCALE)
+                first = image.shape if first is None else first
+                if image.shape != first:
+                    (h, w), (height, width) = image.shape, first
+                    raise ConfigError(f"image {path}: {w} x {h}, but {paths[0][0].name} is {width} x {height}")
+                px.append(find_corners(image, board))
+            corners.append(tuple(px))
+    return corners, (first[1], first[0])
+
+
+def _some(paths: Sequence[Path]) -> str:
+    """Names for a line: all of a few."""
+    names = [path.name for path in paths[:6]]
+    return ", ".join(names) + (f" and {len(paths) - 6} more" if len(paths) > 6 else "")
 
 
 def calibrated(pictures: Pictures, board: Board, kind: str, distances: Sequence[float] | None) -> cal.Calibration:
@@ -128,6 +160,18 @@ def _report(command: str, result: cal.Calibration, pictures: Pictures, board: Bo
         "not_found": pictures.missed(),
     }
     warnings: list[str] = []
+    if pictures.pairs is not None:
+        numbers["without_partner"] = [path.name for path in pictures.pairs.alone]
+        if pictures.pairs.alone:
+            warnings.append(f"left out for want of a partner: {_some(pictures.pairs.alone)}")
+        if pictures.pairs.by_order:
+            left, right = pictures.paths[0]
+            warnings.append(f"the names do not tell the pairs: taken in their order, {left.name} with {right.name}")
+        if board.symmetric():
+            warnings.append(
+                "the board looks the same after half a turn: its corners are numbered so that the pairs agree; "
+                "one with an odd and an even number of corners leaves no doubt"
+            )
     if both:
         n = len(sigmas)
         spread = np.sqrt(np.diag(fit.covariance))[n - 6 :]
