@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 
-.PHONY: run test slow readers draw clean
+.PHONY: run test slow lint format readers draw clean
 
 run: $(READY)
 	$(BIN)/valve-drake run $(ARGS)
@@ -14,6 +14,16 @@ test: $(READY)
 
 slow: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# What ruff and mypy say of the code; `make format` mends what ruff can.
+lint: $(READY) $(VENV)/.lint
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(READY) $(VENV)/.lint
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
 
 # Other people's readers on a log (LOG=FILE, else on a run made for it); those that cannot be installed are skipped.
 readers: $(READY)
@@ -34,6 +44,10 @@ $(READY): pyproject.toml constraints.txt
 	  { echo "libEGL.so.1 is missing: install it (Debian, Ubuntu: apt-get install libegl1)"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@touch $@
+
+$(VENV)/.lint: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[lint]'
 	@touch $@
 
 clean:
