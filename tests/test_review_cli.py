@@ -285,8 +285,8 @@ def test_what_is_no_log_is_one_line_and_2(make, words, tmp_path, capsys):
         (["LOG", "--export", "xml", "--topic", "/health"], "xml"),
         (["LOG", "--html", "LOG"], "another file"),
         (["LOG", "--export", "csv", "--topic", "/health", "--out", "LOG"], "another file"),
-        (["LOG", "--html", "nowhere/at/all.html"], "cannot be written"),
-        (["LOG", "--export", "npz", "--topic", "/health", "--out", "nowhere/at/all.npz"], "cannot be written"),
+        (["LOG", "--html", "nowhere/at/all.html"], "in a folder that exists"),
+        (["LOG", "--export", "npz", "--topic", "/health", "--out", "nowhere/at/all.npz"], "in a folder that exists"),
         ([], "LOG"),
     ],
 )

@@ -1,6 +1,7 @@
 """The curves of a run's page: which series stand in which plot, in what units and colours."""
 
 import dataclasses as dc
+import functools
 import math
 from collections.abc import Sequence
 
@@ -20,19 +21,10 @@ AXES = tuple(zip("xyz", (RED, GREEN, BLUE)))
 
 def make_plots(log: Traces) -> list[Plot]:
     """All plots of a run; those without lines have nothing in this log."""
-    return [
-        _distance(log),
-        _position_error(log),
-        _angle_error(log),
-        _servo_error(log),
-        _servo_speed(log),
-        _forces(log),
-        _couple(log),
-        _angle(log),
-        _angle_difference(log),
-        _tracking(log),
-        _health(log),
-    ]
+    makers = (_distance, _position_error, _angle_error, _servo_error, _servo_speed, _forces, _couple, _angle)
+    makers += (_angle_difference, _tracking, _health)
+    plots = [log.attempt(f"plot {make.__name__[1:]}", functools.partial(make, log), None) for make in makers]
+    return [plot if plot is not None else Plot("", "", []) for plot in plots]
 
 
 def _distance(log: Traces) -> Plot:

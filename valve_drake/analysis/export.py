@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message as Proto
 
-from valve_drake.checks import ConfigError
+from valve_drake import outputs
 from valve_drake.messages import Message
 from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.reader import LogReader
@@ -24,24 +24,29 @@ FORMATS = ("csv", "npz")
 
 
 def write(log: LogReader, topic: str, form: str, path: Path) -> int:
-    """Writes a topic to a file -> number of messages. Raises ConfigError if there is none or it cannot be written."""
+    """Writes a topic to a file -> number of messages. Raises ConfigError if the log has none, OperationFailed."""
     rows = [(record.when, leaves(log.decode(record))) for record in log.records([topic])]
-    try:
-        if form == "csv":
-            path.write_text(to_csv(rows), encoding="utf-8")
-        else:
-            _save(path, to_arrays(rows))
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
+    outputs.write(path, to_csv(rows) if form == "csv" else to_npz(to_arrays(rows)))
     return len(rows)
 
 
-def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
+def was_made(path: Path) -> bool:
+    """Whether a file is a table that `write` made."""
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            return archive.namelist()[:2] == ["time_ns.npy", "time.npy"]
+    with open(path, "rb") as file:
+        return file.read(12) == b"time_ns,time"
+
+
+def to_npz(arrays: dict[str, np.ndarray]) -> bytes:
     """As numpy.savez_compressed, which knows no array called `file`."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w") as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
+    return out.getvalue()
 
 
 def to_csv(rows: Sequence[tuple[int, dict[str, Any]]]) -> str:

@@ -36,6 +36,7 @@ GATED = frozenset(
     + ("/rectangle_estimator/estimate", "/rectangle_estimator/pose")
     + tuple(f"/{camera}/{what}" for camera in CAMERAS for what in ("image", "detections"))
 )
+RESULT = "result"  # metadata that a run writes when it ends
 LATE = 1.5  # periods after which a message is late
 
 
@@ -56,9 +57,9 @@ class TopicRow:
     schema: str
     count: int
     kind: str
-    period_s: float | None  # expected
+    period_s: float | None  # expected; None where there is no rate, or too few messages to see it
     median_s: float | None  # observed
-    lost: int  # holes in the numbering: written once, not in this file
+    lost: int  # holes in the numbering: written once, not in this file; 0 for logs of other programs
     gaps: tuple[Gap, ...]  # in time, where there is a rate; else where the numbering has holes
     silence: Gap | None  # the longest time between two messages
 
@@ -111,26 +112,29 @@ class Integrity:
 
 def examine(log: LogReader) -> Integrity:
     """Looks at every message's time and number; nothing is decoded."""
-    times: dict[str, list[int]] = {name: [] for name in log.topics}
-    numbers: dict[str, list[int]] = {name: [] for name in log.topics}
-    for record in log.records():
-        times[record.topic].append(record.when)
-        numbers[record.topic].append(record.sequence)
     damage = list(log.damage)
-    if before := log.metadata.get("recovered", {}).get("damage"):
-        damage.append(f"recovered from a damaged log: {before}")
-    rows = [
-        _row(name, topic.schema, np.array(times[name]) / NANO, np.array(numbers[name]), log.start, log.end)
-        for name, topic in sorted(log.topics.items())
-    ]
+    if log.past_damage:
+        damage.append(f"recovered from a damaged log: {log.past_damage}")
+    rows = []
+    for name, (when, number) in sorted(log.timing().items()):
+        schema, time = log.topics[name].schema, when / NANO
+        if log.own and len(log.channels(name)) == 1:
+            rows.append(_row(name, schema, time, number.astype(np.int64), log.start, log.end))
+        else:  # other programs number as they like, and have their own rates
+            rows.append(_foreign_row(name, schema, np.sort(time)))
     count = sum(row.count for row in rows)
-    return Integrity(damage, "result" in log.metadata, rows, count, log.path.stat().st_size)
+    return Integrity(damage, RESULT in log.metadata, rows, count, log.path.stat().st_size)
+
+
+def _foreign_row(topic: str, schema: str, time: np.ndarray) -> TopicRow:
+    median, silence = _rhythm(time)
+    return TopicRow(topic, schema, len(time), "changes", None, median, 0, (), silence)
 
 
 def _row(topic: str, schema: str, time: np.ndarray, number: np.ndarray, start: float, end: float) -> TopicRow:
-    steps = np.diff(time)
-    median = float(np.median(steps)) if len(steps) else None
+    median, silence = _rhythm(time)
     period = median if topic in STEADY else PERIODS.get(topic)
+    period = period if period is not None and period > 0 else None  # one message has no rate
     kind = "gated" if topic in GATED else "steady" if topic in STEADY or topic in PERIODS else "changes"
     holes = np.diff(np.concatenate([[-1], number])) - 1
     lost = int(np.maximum(holes, 0).sum())
@@ -140,11 +144,16 @@ def _row(topic: str, schema: str, time: np.ndarray, number: np.ndarray, start: f
         gaps = [Gap(float(edges[k]), float(edges[k + 1]), _between(edges, k, period)) for k in wide]
     else:
         gaps = [Gap(float(edges[k]), float(edges[k + 1]), int(holes[k])) for k in np.flatnonzero(holes > 0)]
-    silence = None
-    if len(steps):
-        k = int(steps.argmax())
-        silence = Gap(float(time[k]), float(time[k + 1]), 0)
     return TopicRow(topic, schema, len(time), kind, period, median, lost, tuple(gaps), silence)
+
+
+def _rhythm(time: np.ndarray) -> tuple[float | None, Gap | None]:
+    """The median and the longest time between two messages; None for fewer than two."""
+    steps = np.diff(time)
+    if len(steps) == 0:
+        return None, None
+    k = int(steps.argmax())
+    return float(np.median(steps)), Gap(float(time[k]), float(time[k + 1]), 0)
 
 
 def _between(edges: np.ndarray, k: int, period: float) -> int:

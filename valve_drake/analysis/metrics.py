@@ -1,6 +1,7 @@
 """From a log to numbers: what happened in a run. Reads nothing but the log (through traces.py)."""
 
 import dataclasses as dc
+import functools
 import os
 
 import numpy as np
@@ -102,14 +103,8 @@ def summarize(log: str | os.PathLike | LogReader | Traces) -> Summary:
         out.outcome = log.spans[-1].mode
     out.angle_camera_rad = log.verify_angle
     out.angle_true_rad = float(log.truth.angle[-1]) if log.truth is not None else None
-    _turning(log, out)
-    _estimates(log, out)
-    _servo(log, out)
-    _joints(log, out)
-    if log.health is not None:
-        _, devices, ages = log.health
-        out.health_max_age_s = float(ages.max())
-        out.health_oldest = devices[int(ages.max(axis=0).argmax())] if ages.max() > 0 else ""
+    for part in (_turning, _estimates, _servo, _joints, _health):
+        log.attempt(part.__name__.removeprefix("_"), functools.partial(part, log, out), None)
     out.faults = log.faults
     if log.selector is not None:
         did = log.selector
@@ -119,6 +114,14 @@ def summarize(log: str | os.PathLike | LogReader | Traces) -> Summary:
             did["tripped"],
         )
     return out
+
+
+def _health(log: Traces, out: Summary) -> None:
+    if log.health is None:
+        return
+    _, devices, ages = log.health
+    out.health_max_age_s = float(ages.max())
+    out.health_oldest = devices[int(ages.max(axis=0).argmax())] if ages.max() > 0 else ""
 
 
 def _turning(log: Traces, out: Summary) -> None:

@@ -11,10 +11,13 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from markupsafe import Markup, escape
 
+from valve_drake.messages import Mode
+
 WIDTH, LEFT, RIGHT, BOTTOM = 1120, 62, 10, 20  # [px]
 BUCKETS = 1400  # across a plot: of each, least and greatest value are drawn
 BREAK = 0.3  # a line is not drawn across a longer silence [s]
 BAND_BREAK = 1.1  # the same for bands [s]
+_MODES = frozenset(Mode)
 
 
 @dc.dataclass(frozen=True)
@@ -105,10 +108,16 @@ class Plot:
 
 def shades(spans: Iterable, tall: float) -> str:
     """The modes as tinted areas, in seconds across."""
+    rows = ((mode_class(span.mode), span.start, span.duration) for span in spans)
     return "".join(
-        f'<rect class="m-{escape(span.mode)}" x="{span.start:.4f}" y="0" width="{span.duration:.4f}" height="{tall}"/>'
-        for span in spans
+        f'<rect class="{css}" x="{start:.4f}" y="0" width="{duration:.4f}" height="{tall}"/>'
+        for css, start, duration in rows
     )
+
+
+def mode_class(mode: str) -> str:
+    """The CSS class of a mode's colour; of a mode that this program does not know, none that exists."""
+    return f"m-{mode}" if mode in _MODES else "m-unknown"
 
 
 def time_ticks(start: float, end: float, bottom: float) -> str:
@@ -126,7 +135,7 @@ def time_ticks(start: float, end: float, bottom: float) -> str:
 
 def nice_ticks(low: float, high: float, count: int) -> list[float]:
     """Multiples of 1, 2 or 5 times a power of ten, about `count` of them."""
-    if not (math.isfinite(low) and math.isfinite(high) and high > low):
+    if not (math.isfinite(high - low) and high > low):
         return [low]
     rough = (high - low) / count
     power = 10.0 ** math.floor(math.log10(rough))

@@ -4,9 +4,10 @@
 """
 
 import dataclasses as dc
-import html
+import functools
 import math
 import os
+import urllib.parse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,15 @@ from valve_drake.analysis.curves import make_plots, overlaid
 from valve_drake.analysis.integrity import Integrity, examine, words
 from valve_drake.analysis.metrics import Summary, summarize
 from valve_drake.analysis.pictures import Album, Moment
-from valve_drake.analysis.plots import LEFT, RIGHT, WIDTH, nice_ticks
-from valve_drake.analysis.traces import ModeSpan, Traces
+from valve_drake.analysis.plots import LEFT, RIGHT, WIDTH, Plot, mode_class, nice_ticks
+from valve_drake.analysis.traces import MOST, ModeSpan, Traces
 from valve_drake.messages import Mode
 from valve_drake.pace import PACE, Pace
+from valve_drake.recording.container import LIBRARY
 from valve_drake.recording.reader import LogReader
 
 AT_REST = (Mode.MEASURE, Mode.VERIFY)
+MOMENTS = 200  # changes of mode that are shown with pictures
 ROW = 22  # of the timeline [px]
 LONGEST = 48  # text of a value where two logs part [characters]
 
@@ -68,16 +71,17 @@ def review(path: str | os.PathLike) -> Review:
         text,
         _parsed(text),
         recording if recording.is_file() else None,
-        _pace(log),
+        traces.attempt(PACE, lambda: _pace(log), None),
     )
 
 
 def _pace(log: LogReader) -> Pace | None:
     """The last that the log says of it: it counts from the beginning."""
-    last = None
-    for _, _, message in log.messages([PACE] if PACE in log.topics else []):
-        last = message
-    return last
+    found = log.topics.get(PACE)
+    if found is None or not found.count or found.schema != "valve_drake.Pace":
+        return None
+    *_, (_, _, last) = log.messages([PACE], found.end)
+    return last if isinstance(last, Pace) and all(math.isfinite(v) for v in vars(last).values()) else None
 
 
 def facts(found: Review) -> dict[str, Any]:
@@ -93,6 +97,8 @@ def facts(found: Review) -> dict[str, Any]:
     out = {
         "log": str(found.log.path),
         "outcome": found.summary.outcome or "unfinished",
+        "library": found.log.library,
+        "own": found.log.own,
         "sound": found.integrity.sound,
         "finished": found.integrity.finished,
         "damage": found.integrity.troubles,
@@ -202,6 +208,13 @@ def plain(value: Any) -> Any:
     return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
+def was_made(path: Path) -> bool:
+    """Whether a file is a page that `review` made."""
+    with open(path, "rb") as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - 1000))
+        return b"Made by <code>valve-drake review</code>" in file.read()
+
+
 # ---------------------------------------------------------------- the page
 
 
@@ -211,7 +224,7 @@ def page(found: Review, beside: Path) -> str:
     spans = found.traces.spans
     plots = [plot for plot in make_plots(found.traces) if plot.lines]
     album = Album(found.log)
-    worst = _worst(found, album)
+    worst = found.traces.attempt("worst estimate", lambda: _worst(found, album), None)
     return (
         _environment()
         .get_template("review.html.j2")
@@ -222,14 +235,15 @@ def page(found: Review, beside: Path) -> str:
             integrity=found.integrity,
             tiles=tiles(found.summary, found.pace),
             timeline=timeline(spans, start, end, found.integrity.gaps()),
-            plots=[(plot, plot.svg(spans, start, end)) for plot in plots],
+            writer=writer(found.log),
+            plots=_drawn(found.traces, plots, spans, start, end),
             missing=found.traces.missing,
             spans=spans,
             span=(start, end),
-            moments=album.changes_of_mode(spans),
+            moments=found.traces.attempt("pictures", lambda: album.changes_of_mode(spans[:MOMENTS]), []),
             worst=worst,
-            log_lines=_log_lines(found.log),
-            recording=os.path.relpath(found.recording, beside) if found.recording else None,
+            log_lines=found.traces.attempt("/log", lambda: _log_lines(found.log), []),
+            recording=_link(found.recording, beside),
             geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
         )
     )
@@ -260,13 +274,35 @@ def comparison_page(found: Comparison, beside: Path) -> str:
             main=main,
             others=[row for row in found.numbers if row not in main],
             timelines=[timeline(r.traces.spans, *_extent(r.log), r.integrity.gaps()) for r in (a, b)],
-            plots=[(plot, plot.svg(spans, start, end)) for plot in plots],
+            plots=_drawn(a.traces, plots, spans, start, end),
             spans=spans,
             span=(start, end),
-            recordings=[os.path.relpath(r.recording, beside) if r.recording else None for r in (a, b)],
+            recordings=[_link(r.recording, beside) for r in (a, b)],
             geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
         )
     )
+
+
+def writer(log: LogReader) -> str:
+    """A sentence on who wrote a log of another program; "" for one of this program."""
+    if log.own:
+        return ""
+    name = log.library or "a program that does not give its name"
+    return f"written by {name}, not by {LIBRARY}: topics and counts are shown, and what is in this program's schemas"
+
+
+def _drawn(traces: Traces, plots: Sequence[Plot], spans: Sequence[ModeSpan], start: float, end: float) -> list:
+    """(plot, its SVG) of those that can be drawn."""
+    drawn = [
+        (plot, traces.attempt(f"plot {plot.key}", functools.partial(plot.svg, spans, start, end), None))
+        for plot in plots
+    ]
+    return [(plot, svg) for plot, svg in drawn if svg is not None]
+
+
+def _link(path: Path | None, beside: Path) -> str | None:
+    """A relative link to a file, as text of an URL: a name may hold what means something there."""
+    return urllib.parse.quote(os.fsencode(os.path.relpath(path, beside))) if path else None
 
 
 def _extent(log: LogReader) -> tuple[float, float]:
@@ -287,39 +323,39 @@ def timeline(spans: Sequence[ModeSpan], start: float, end: float, gaps: Sequence
     def x(time: float) -> float:
         return left + (time - start) / (end - start) * (WIDTH - left - right)
 
-    out = [f'<svg class="gantt" viewBox="0 0 {WIDTH} {height}" role="img" aria-label="Modes over time">']
+    out = [
+        Markup('<svg class="gantt" viewBox="0 0 {} {}" role="img" aria-label="Modes over time">').format(WIDTH, height)
+    ]
+
+    def add(template: str, *values: object) -> None:
+        out.append(Markup(template).format(*values))  # escapes every value: modes and reasons are the log's text
+
     bottom = ROW * (len(modes) + bool(gaps))
     for tick in nice_ticks(start, end, 10):
-        out.append(f'<line x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="0" y2="{bottom}"/>')
-        out.append(f'<text class="tick" x="{x(tick):.1f}" y="{bottom + 15}">{tick:g}</text>')
+        add('<line x1="{0:.1f}" x2="{0:.1f}" y1="0" y2="{1}"/>', x(tick), bottom)
+        add('<text class="tick" x="{:.1f}" y="{}">{:g}</text>', x(tick), bottom + 15, tick)
     for row, mode in enumerate(modes):
         middle = ROW * row + ROW / 2
-        out.append(f'<text class="name" x="{left - 8}" y="{middle + 4}">{html.escape(_label(mode))}</text>')
+        add('<text class="name" x="{}" y="{}">{}</text>', left - 8, middle + 4, _label(mode))
         for span in (s for s in spans if s.mode == mode):
             width = max(x(span.end) - x(span.start), 2.0)
             words_ = f"{span.duration:.2f} s" + (f", retry {span.attempt}" if span.attempt else "")
-            hover = html.escape(f"{_label(mode)}: {span.start:.3f} to {span.end:.3f} s. {span.reason}")
-            out.append(
-                f'<g class="bar" data-start="{span.start:.4f}" data-end="{span.end:.4f}"><title>{hover}</title>'
-                f'<rect class="m-{mode} {"retry" if span.attempt else ""}" x="{x(span.start):.1f}" y="{middle - 8}" '
-                f'width="{width:.1f}" height="16" rx="2"/>{_bar_text(x(span.start), width, middle, words_)}</g>'
-            )
+            hover = f"{_label(mode)}: {span.start:.3f} to {span.end:.3f} s. {span.reason}"
+            add('<g class="bar" data-start="{:.4f}" data-end="{:.4f}"><title>{}</title>', span.start, span.end, hover)
+            add('<rect class="{} {}" x="{:.1f}" ', mode_class(mode), "retry" if span.attempt else "", x(span.start))
+            add('y="{}" width="{:.1f}" height="16" rx="2"/>', middle - 8, width)
+            # Behind the bar, before it where there is no room.
+            room = x(span.start) + width + 7 * len(words_) + 12 < WIDTH
+            place, kind = (x(span.start) + width + 6, "time") if room else (x(span.start) - 6, "time before")
+            add('<text class="{}" x="{:.1f}" y="{}">{}</text></g>', kind, place, middle + 4, words_)
     if gaps:
         middle = ROW * len(modes) + ROW / 2
-        out.append(f'<text class="name bad" x="{left - 8}" y="{middle + 4}">missing</text>')
+        add('<text class="name bad" x="{}" y="{}">missing</text>', left - 8, middle + 4)
         for a, b in gaps:
-            out.append(
-                f'<rect class="gap" x="{x(a):.1f}" y="{middle - 8}" width="{max(x(b) - x(a), 2):.1f}" height="16"/>'
-            )
-    out.append("</svg>")
-    return Markup("".join(out))
-
-
-def _bar_text(x: float, width: float, middle: float, text: str) -> str:
-    """Behind the bar, before it where there is no room."""
-    if x + width + 7 * len(text) + 12 < WIDTH:
-        return f'<text class="time" x="{x + width + 6:.1f}" y="{middle + 4}">{text}</text>'
-    return f'<text class="time before" x="{x - 6:.1f}" y="{middle + 4}">{text}</text>'
+            wide = max(x(b) - x(a), 2)
+            add('<rect class="gap" x="{:.1f}" y="{}" width="{:.1f}" height="16"/>', x(a), middle - 8, wide)
+    out.append(Markup("</svg>"))
+    return Markup("").join(out)
 
 
 def tiles(s: Summary, pace: Pace | None = None) -> list[tuple[str, str, str]]:
@@ -390,7 +426,9 @@ def _log_lines(log: LogReader) -> list[tuple[float, str, str, int]]:
     """(time, who, what, level) of /log."""
     if "/log" not in log.topics:
         return []
-    return [(t, m.name, m.message, m.level) for _, t, m in log.messages(["/log"]) if hasattr(m, "level")]
+    if log.topics["/log"].schema != "foxglove.Log" or log.topics["/log"].count > MOST:
+        return []
+    return [(t, m.name, m.message, m.level) for _, t, m in log.messages(["/log"])]
 
 
 def _parsed(text: str) -> dict[str, Any]:
@@ -410,7 +448,7 @@ def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters |= {"label": _label, "rate": _rate, "words": words, "size": _size}
+    environment.filters |= {"label": _label, "mode_class": mode_class, "rate": _rate, "words": words, "size": _size}
     environment.globals |= {"degrees": math.degrees, "AT_REST": AT_REST}
     return environment
 

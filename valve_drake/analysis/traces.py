@@ -5,8 +5,9 @@ and the *nominal* head: an error of the head's mount counts as an error of the e
 """
 
 import dataclasses as dc
-from functools import cached_property
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -33,6 +34,9 @@ SCHEMAS = {  # of the topics that are read here
     "/truth/marker_pose": "valve_drake.Vector",
     "/truth/valve_angle": "valve_drake.Vector",
 }
+MOST, LARGEST = 1_000_000, 1 << 20  # messages of a topic that are decoded; of one of them [bytes]
+MOST_SPANS = 2000  # stays in modes
+T = TypeVar("T")
 HALF_TURN = make(rot_z(np.pi), np.zeros(3))
 
 
@@ -114,15 +118,35 @@ class Truth:
     angle: np.ndarray  # turned since the start, positive opens (N,) [rad]
 
 
+class _Trace(functools.cached_property, Generic[T]):
+    """A time series, read when it is first asked for; None where the log's values make none."""
+
+    def __init__(self, make: Callable[["Traces"], T]):
+        name = make.__name__
+        super().__init__(lambda traces: traces.attempt(name, lambda: make(traces), None))
+
+
 class Traces:
     """The time series of one log, each read when it is first asked for. None or empty: the log does not have it.
 
-    missing: topics that could not be read, with the reason.
+    missing: topics that could not be read and parts that could not be made of them, with the reason.
     """
 
     def __init__(self, reader: LogReader):
         self.reader = reader
         self.missing: dict[str, str] = {}
+
+    def attempt(self, name: str, make: Callable[[], T], default: T) -> T:
+        """What `make` gives, or `default` and a line in `missing`.
+
+        A log can hold messages of the right schema and no sense (a damaged file, another program): vectors of any
+        length, NaN, texts where numbers are meant. One such topic must not cost the rest of the page.
+        """
+        try:
+            return make()
+        except Exception as error:
+            self.missing[name] = f"holds values that cannot be used: {type(error).__name__}: {str(error)[:120]}"
+            return default
 
     def inside(self, time: np.ndarray, *modes: str) -> np.ndarray:
         """Which of these instants fall into one of the modes -> (N,) bool."""
@@ -132,22 +156,25 @@ class Traces:
                 found |= (time > span.start) & (time <= span.end)
         return found
 
-    @cached_property
+    @functools.cached_property
     def modes(self) -> list[Any]:
-        """The supervisor's messages."""
-        return [mode for _, mode in self._messages("/supervisor/mode")]
+        """The supervisor's messages that have a time."""
+        return [mode for _, mode in self._messages("/supervisor/mode") if np.isfinite(mode.since)]
 
-    @cached_property
+    @functools.cached_property
     def spans(self) -> list[ModeSpan]:
         """The stays in modes, in order."""
         starts: list[Any] = []
         for mode in self.modes:
             if not starts or starts[-1].activation != mode.activation:
                 starts.append(mode)
+        if len(starts) > MOST_SPANS:
+            self.missing["modes"] = f"change {len(starts)} times: the first {MOST_SPANS} are shown"
+            starts = starts[:MOST_SPANS]
         ends = [mode.since for mode in starts[1:]] + [self.reader.end]
         return [ModeSpan(m.mode, m.activation, m.since, end, m.reason, m.attempt) for m, end in zip(starts, ends)]
 
-    @cached_property
+    @_Trace
     def joints(self) -> Joints | None:
         states, commands = self._messages("/joint_states"), self._messages("/joint_commands")
         if not states:
@@ -166,7 +193,7 @@ class Traces:
                     commanded[:, k] = asked[before, known.index(name)]
         return Joints(time, names, table[:, :, 0], table[:, :, 1], commanded)
 
-    @cached_property
+    @_Trace
     def truth(self) -> Truth | None:
         topics = ("/truth/base_pose", "/truth/marker_pose", "/truth/valve_angle")
         rows = [{t: m.values for t, m in self._messages(topic)} for topic in topics]
@@ -178,7 +205,7 @@ class Traces:
         base = np.column_stack([base[:, :2], np.unwrap(base[:, 2])])
         return Truth(time, base, marker.reshape(-1, 3, 4), angle[:, 0] - angle[0, 0])
 
-    @cached_property
+    @_Trace
     def estimates(self) -> Estimates | None:
         every = [m for _, m in self._messages("/rectangle_estimator/estimate") if m.sequence >= 0]
         if not every:
@@ -221,7 +248,7 @@ class Traces:
             errors.append(np.concatenate([angles, X[:, 3] - Y[:, 3]]))
         return np.array(errors).reshape(-1, 6)
 
-    @cached_property
+    @_Trace
     def stereo(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Stage 1: times of capture and distances where the marker was found."""
         rows = [m for _, m in self._messages("/stereo_positioning/position") if m.found]
@@ -229,7 +256,7 @@ class Traces:
             return None
         return np.array([m.time for m in rows]), np.array([np.linalg.norm(m.p_LV) for m in rows])
 
-    @cached_property
+    @_Trace
     def turn(self) -> dict[str, np.ndarray] | None:
         """Stage 5 as recorded; forces and moments as magnitudes."""
         names = ("stage", "angle", "angle_reference", "torque", "share_left", "squeeze")
@@ -241,7 +268,7 @@ class Traces:
         out |= {name: np.linalg.norm([getattr(m, name) for _, m in rows], axis=1) for name in vectors}
         return out | {"time": np.array([t for t, _ in rows])}
 
-    @cached_property
+    @_Trace
     def camera_angle(self) -> tuple[np.ndarray, np.ndarray] | None:
         """How far the valve has turned since it was measured, by the head cameras: times of capture, angles.
 
@@ -261,7 +288,7 @@ class Traces:
             angle = np.array([h + wrap(a - zero - h, np.pi) for a, h in zip(raw, hands)])
         return found.time, angle - (np.mean(angle[measured]) if measured.any() else 0.0)
 
-    @cached_property
+    @_Trace
     def servo(self) -> dict[str, np.ndarray] | None:
         """Stage 4 while it is at work: distances from the reference [m] and the hands' measured speeds [m/s]."""
         rows = self._messages("/image_servo/servo")
@@ -280,12 +307,12 @@ class Traces:
                 out[f"{side}_speed"] = np.array([np.linalg.norm(j @ row) for j, row in zip(J, v)])
         return out
 
-    @cached_property
+    @functools.cached_property
     def reports(self) -> list[tuple[float, Any]]:
         """The station's health messages with their times."""
         return self._messages("/health")
 
-    @cached_property
+    @_Trace
     def health(self) -> tuple[np.ndarray, tuple[str, ...], np.ndarray] | None:
         """Times, devices, ages (N, D) [s]."""
         rows = [(t, m) for t, m in self.reports if m.devices]
@@ -295,7 +322,7 @@ class Traces:
         rows = [(t, m) for t, m in rows if m.devices == devices]
         return np.array([t for t, _ in rows]), devices, np.array([m.ages for _, m in rows])
 
-    @cached_property
+    @functools.cached_property
     def faults(self) -> list[tuple[float, str]]:
         """When which fault was first reported."""
         out, before = [], set()
@@ -305,7 +332,7 @@ class Traces:
             before = now
         return out
 
-    @cached_property
+    @_Trace
     def selector(self) -> dict[str, dict[str, int]] | None:
         """command_selector's ticks by what it did: "limited", "refused", "tripped" -> name -> ticks."""
         rows = self._messages("/command_selector/report")
@@ -318,7 +345,7 @@ class Traces:
                     count[name] = count.get(name, 0) + 1
         return out
 
-    @cached_property
+    @_Trace
     def verify_angle(self) -> float | None:
         """What the camera saw after letting go [rad]."""
         verifying = {span.activation for span in self.spans if span.mode == Mode.VERIFY}
@@ -335,9 +362,11 @@ class Traces:
             self.missing[topic] = "not in this log"
         elif found.schema != SCHEMAS[topic]:
             self.missing[topic] = f"holds {found.schema}, not {SCHEMAS[topic]}"
+        elif found.count > MOST:
+            self.missing[topic] = f"holds {found.count} messages, more than the {MOST} that can be shown"
         else:
             try:
-                return [(time, message) for _, time, message in self.reader.messages([topic])]
+                return [(r.time, self.reader.decode(r)) for r in self.reader.records([topic]) if len(r.data) <= LARGEST]
             except ConfigError as error:
                 self.missing[topic] = str(error)
         return []

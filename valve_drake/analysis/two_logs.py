@@ -11,6 +11,7 @@ from valve_drake.analysis.comparison import Divergence, differences
 from valve_drake.analysis.metrics import Summary
 from valve_drake.analysis.traces import ModeSpan
 from valve_drake.checks import ConfigError
+from valve_drake.recording.container import RECOVERED
 from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.reader import LogReader, Record
 
@@ -86,11 +87,13 @@ def settings(a: dict, b: dict, path: str = "") -> list[tuple[str, Any, Any]]:
 def compare_messages(a: LogReader, b: LogReader) -> list[TopicPair]:
     """All topics of both logs, in the order of the first log: message by message, the time included, to the bit.
 
-    Messages are held against each other by their numbers; what a damaged or unfinished log lacks is left out.
+    Messages are held against each other by their numbers, in logs of other programs by their order; what a damaged or
+    unfinished log lacks is left out.
     """
     logs = (a, b)
-    keys = [_keys(log) for log in logs]
-    partial = [bool(log.damage) or "recovered" in log.metadata for log in logs]
+    numbered = a.own and b.own
+    keys = [_keys(log, numbered) for log in logs]
+    partial = [bool(log.damage) or RECOVERED in log.metadata for log in logs]
     out = []
     for topic in dict.fromkeys((*a.topics, *b.topics)):
         left, right = (found.get(topic, {}) for found in keys)
@@ -100,7 +103,7 @@ def compare_messages(a: LogReader, b: LogReader) -> list[TopicPair]:
             if x == y:
                 equal += 1
             elif not (x is None and partial[0]) and not (y is None and partial[1]):
-                first = _divergence(topic, _record(a, topic, x, number), _record(b, topic, y, number), a, b)
+                first = _divergence(topic, _record(a, topic, x), _record(b, topic, y), a, b)
                 break
         out.append(TopicPair(topic, len(left), len(right), equal, first))
     return out
@@ -111,20 +114,21 @@ def first_divergence(topics: Sequence[TopicPair]) -> Divergence | None:
     return min((pair.first for pair in topics if pair.first), key=lambda found: found.time, default=None)
 
 
-def _keys(log: LogReader) -> dict[str, dict[int, tuple[int, int]]]:
+def _keys(log: LogReader, numbered: bool) -> dict[str, dict[int, tuple[int, int]]]:
     """Topic -> number of the message -> its time and the hash of its content."""
     out: dict[str, dict[int, tuple[int, int]]] = {}
     for record in log.records():
-        out.setdefault(record.topic, {})[record.sequence] = (record.when, hash(record.data))
+        rows = out.setdefault(record.topic, {})
+        rows[record.sequence if numbered else len(rows)] = (record.when, hash(record.data))
     return out
 
 
-def _record(log: LogReader, topic: str, at: tuple[int, int] | None, number: int) -> Record | None:
-    """The topic's message of this number, None if there is none."""
+def _record(log: LogReader, topic: str, at: tuple[int, int] | None) -> Record | None:
+    """The topic's message of this time and content, None if there is none."""
     if at is None:
         return None
     time = at[0] / NANO
-    return next(r for r in log.records([topic], time - 1e-6, time + 1e-6) if r.sequence == number)
+    return next(r for r in log.records([topic], time - 1e-6, time + 1e-6) if (r.when, hash(r.data)) == at)
 
 
 def _divergence(topic: str, x: Record | None, y: Record | None, a: LogReader, b: LogReader) -> Divergence:

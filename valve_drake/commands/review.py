@@ -2,13 +2,15 @@
 
 import argparse
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
+from valve_drake import outputs
 from valve_drake.checks import ConfigError
 from valve_drake.commands.common import DAMAGED, OK, Subcommands, print_summary
 from valve_drake.console import console as make_console
 from valve_drake.console import say, styled
+
+MOST_TOPICS = 30  # of another program's log, on the terminal
 
 
 def add(commands: Subcommands) -> None:
@@ -29,19 +31,17 @@ def command(options: argparse.Namespace) -> int:
         raise ConfigError(f"review takes one log or two, got {len(options.logs)}")
     if options.export or options.topic or options.out:
         return _export(options)
-    found = [report.review(log) for log in options.logs]
-    if len(found) == 1:
-        subject, facts, page, name = found[0], report.facts, report.page, options.logs[0].stem
-    else:
-        subject, facts, page = report.compare(*found), report.comparison_facts, report.comparison_page
-        name = "-".join(log.stem for log in options.logs)
+    name = "-".join(log.stem for log in options.logs)
     html = options.html or (None if options.json else options.logs[0].with_name(f"{name}.review.html"))
     if html is not None:
-        _keep_apart("--html", html, options.logs)
-        try:
-            html.write_text(page(subject, html.parent.resolve()), encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"{html} cannot be written: {error.strerror}") from None
+        html = outputs.check(html, "--html", options.logs, report.was_made)
+    found = [report.review(log) for log in options.logs]
+    if len(found) == 1:
+        subject, facts, page = found[0], report.facts, report.page
+    else:
+        subject, facts, page = report.compare(*found), report.comparison_facts, report.comparison_page
+    if html is not None:
+        outputs.write(html, page(subject, html.parent.resolve()))
     if options.json:
         print(json.dumps(facts(subject) | {"html": str(html) if html else None}))
     else:
@@ -50,19 +50,21 @@ def command(options: argparse.Namespace) -> int:
     return OK if all(one.integrity.sound for one in found) else DAMAGED
 
 
-def _keep_apart(option: str, path: Path, logs: Sequence[Path]) -> None:
-    if path.resolve() in [log.resolve() for log in logs]:
-        raise ConfigError(f"{option} must be another file than the log, got {path}")
-
-
 def _print_review(found: list, subject: object) -> None:
-    from valve_drake.analysis.report import parting_values
+    from valve_drake.analysis import report
 
     console = make_console()
     for one in found:
         if len(found) > 1:
             console.print(f"{one.log.path}:")
-        print_summary(console, one.summary)
+        if one.log.own or one.summary.spans:
+            print_summary(console, one.summary)
+        if not one.log.own:
+            console.print(f"{one.log.path} was {report.writer(one.log)}")
+            for topic in one.integrity.topics[:MOST_TOPICS]:
+                console.print(f"  {topic.topic}  {topic.schema or '-'}  {topic.count}")
+            if len(one.integrity.topics) > MOST_TOPICS:
+                console.print(f"  and {len(one.integrity.topics) - MOST_TOPICS} more")
         for line in one.integrity.troubles:
             console.print(f"damaged: {line}")
         for row in one.integrity.late[:10]:
@@ -77,7 +79,7 @@ def _print_review(found: list, subject: object) -> None:
         word = ("identical", "bold green") if subject.sound else "no difference"
         console.print(styled(word, ": what both hold is equal to the bit"))
         return
-    a, b = parting_values(first)
+    a, b = report.parting_values(first)
     words = f"{first.field}: {a} and {b}" if first.field else f"only in {found[0 if b is None else 1].log.path}"
     console.print(f"they part at t = {first.time:.6f} s, {first.topic} {words}")
 
@@ -90,10 +92,9 @@ def _export(options: argparse.Namespace) -> int:
         raise ConfigError("an export wants both --export csv|npz and --topic")
     if len(options.logs) != 1:
         raise ConfigError(f"an export is of one log, got {len(options.logs)}")
-    log = LogReader(options.logs[0])
     name = f"{options.logs[0].stem}{options.topic.replace('/', '.')}.{options.export}"
-    out = options.out or options.logs[0].with_name(name)
-    _keep_apart("--out", out, options.logs)
+    out = outputs.check(options.out or options.logs[0].with_name(name), "--out", options.logs, export.was_made)
+    log = LogReader(options.logs[0])
     count = export.write(log, options.topic, options.export, out)
     if options.json:
         print(json.dumps({"topic": options.topic, "messages": count, "out": str(out), "damage": log.damage}))
