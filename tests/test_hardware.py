@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bad_messages import bad_messages, on
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
@@ -13,7 +14,8 @@ from valve_drake import scenario as scenarios
 from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.messages import CameraFrame
 from valve_drake.ports import SLOT, TICK
-from valve_drake.stations import lcm_channels
+from valve_drake.stations import hardware, lcm_channels
+from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_rig import encode_frame
 from valve_drake.stations.contract import CAMERAS, CONTRACT, check_contract
 from valve_drake.stations.hardware import SPEEDS, RobotLink, make_hardware_station
@@ -24,8 +26,8 @@ from valve_drake.stations.lcm_channels import (
     DEVICES,
     REPORTS,
     REQUEST,
+    ROBOT,
     STATE,
-    Bus,
     HardwareConfig,
     from_utime,
     image_message,
@@ -48,8 +50,9 @@ class Puppet:
 
     def __init__(self, **hardware):
         lcm = DrakeLcm("memq://")
-        self.config = HardwareConfig(answer_time=0.05, **hardware)
-        self.link = RobotLink(Bus(self.config, lcm))
+        self.config = HardwareConfig(answer_time=0.05, image_size=[16, 16], **hardware)
+        self.told: list[str] = []
+        self.link = RobotLink(Bus(self.config, lcm), notice=self.told.append)
         self.link.clock = lambda: self.now
         self.now = 100.0
         self.bus = Bus(self.config, lcm)
@@ -130,6 +133,10 @@ def test_stamps_on_the_grid_of_slots_come_back_exactly():
         ("hardware.lcm_url=http://x", ["hardware.lcm_url", "udpm", "http"]),
         ("hardware.channels.left_leg=A", ["hardware.channels", "left_leg"]),
         ("hardware.channels={base.command: A, torso.command: A}", ["hardware.channels", "A"]),
+        ("hardware.lcm_url=udpm://10.0.0.1:7667", ["hardware.lcm_url", "multicast", "10.0.0.1"]),
+        ("hardware.network=''", ["hardware.network", "interface"]),
+        ("hardware.image_size=[640]", ["hardware.image_size", "640"]),
+        ("hardware.image_size=[640, 100000]", ["hardware.image_size", "100000"]),
         ("hardware.answer_time=0", ["hardware.answer_time"]),
         ("hardware.image_age=1.5", ["hardware.image_age", "1.5"]),  # where the head was then is not known any more
         ("hardware.robot_period=0.01", ["hardware.robot_period", "1/128"]),
@@ -220,6 +227,49 @@ def test_another_type_on_a_channel_is_refused():
     puppet.bus.lcm.Publish("VALVE_BASE_STATUS", CHANNELS["left_gripper.status"].encode(0, values(0)).encode())
     with pytest.raises(ConfigError, match="VALVE_BASE_STATUS does not carry lcmt_drake_signal"):
         puppet.start()
+
+
+def test_a_long_wait_for_the_robot_says_what_is_missing_and_the_operator_can_end_it(monkeypatch):
+    assert HardwareConfig().answer_time == 30
+    monkeypatch.setattr(hardware, "NOTICE", 0.02)
+    puppet = Puppet()
+    puppet.report(skip=("torso.status",))
+    with pytest.raises(OperationFailed, match="does not answer"):
+        puppet.link.start()
+    assert puppet.told == ["waiting up to 0.05 s for the robot: nothing yet on VALVE_TORSO_STATUS"]
+    puppet = Puppet()
+    puppet.link.stop = lambda: True
+    with pytest.raises(OperationFailed, match="stopped by the operator before"):
+        puppet.link.start()
+
+
+def test_a_program_does_not_start_beside_another_one_and_gives_no_command():
+    puppet = Puppet()
+    other = Bus(puppet.config, puppet.bus.lcm)
+    other.announce(CONTROLLER)
+    puppet.bus.pump()
+    with pytest.raises(OperationFailed, match="another program is on"):
+        puppet.start()
+    assert not {row.key for row in COMMANDS} & set(puppet.heard)
+
+
+def test_a_program_does_not_start_with_two_robots():
+    puppet = Puppet()
+    for _ in range(2):
+        Bus(puppet.config, puppet.bus.lcm).announce(ROBOT)
+    with pytest.raises(OperationFailed, match="2 robots are on"):
+        puppet.start()
+
+
+def test_another_program_or_robot_that_comes_later_is_a_fault(puppet):
+    assert not puppet.step(4).health.faults
+    others = [Bus(puppet.config, puppet.bus.lcm) for _ in range(2)]
+    others[0].announce(CONTROLLER)
+    assert "another program commands this robot" in puppet.step(4).health.faults
+    for robot in others:
+        robot._announced = -np.inf
+        robot.announce(ROBOT)
+    assert "two robots on the bus" in puppet.step(4).health.faults
 
 
 def test_lock_step_is_kept_by_both_or_by_none():
@@ -340,6 +390,62 @@ def test_a_wrong_message_on_the_way_is_a_fault_and_no_news(puppet):
     assert puppet.age(shown, "torso") == pytest.approx(4 * TICK)
 
 
+def test_a_single_bad_message_is_dropped_and_counted(puppet):
+    puppet.step(3)
+    puppet.bus.lcm.Publish("VALVE_TORSO_STATUS", b"nonsense")
+    puppet.link.bus.pump()
+    for _ in range(20):
+        shown = puppet.step()
+        assert not shown.health.faults
+    assert puppet.link.dropped == {"torso": 1}
+
+
+def test_sync_that_is_none_is_dropped(puppet):
+    for numbers in ([np.nan, 0.0], [np.inf, 1.0], [], [1.0]):
+        puppet.bus.say("robot.sync", 0, {str(k): value for k, value in enumerate(numbers)})
+        puppet.link.bus.pump()
+    assert puppet.link.dropped == {"robot": 4}
+
+
+@pytest.mark.parametrize("wild", [2**63 - 1, -(2**63), 0])
+def test_a_single_wild_stamp_is_dropped(puppet, wild):
+    good = puppet.step(4)
+    for row in REPORTS:
+        puppet.bus.send(row.key, row.encode(wild, values(9)))
+    puppet.link.bus.pump()
+    shown = puppet.step(4, said=good.values)
+    assert not shown.health.faults
+    np.testing.assert_array_equal(shown.values["left_arm.position_measured"], good.values["left_arm.position_measured"])
+
+
+def test_a_finite_number_that_no_sensor_measures_is_as_good_as_none(puppet):
+    good = puppet.step(4)
+    shown = puppet.step(4, said={port: np.full(size, 1e300) for port, size in OUT.items()})
+    assert "torso: not finite" in shown.health.faults
+    np.testing.assert_array_equal(shown.values["torso.position_measured"], good.values["torso.position_measured"])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_is_sent_to_the_program_it_goes_on_and_recovers(seed):
+    puppet = Puppet()
+    puppet.start()
+    rng = np.random.default_rng(seed)
+    said = values(1) | {port: np.zeros(OUT[port]) for port in OUT if port in SPEEDS}
+    for message in bad_messages(rng, ROBOT, 600):
+        on(puppet.bus, message)
+        puppet.link.bus.pump()
+        if rng.random() < 0.3:
+            shown = puppet.step(said=said)
+            for camera in CAMERAS:
+                look(puppet, shown, camera)
+            puppet.link.send(puppet.tick * TICK, values(1, IN))
+    assert sum(puppet.link.dropped.values()) > 100
+    for k in range(256):
+        shown = puppet.step(said=said | values(1000 + k, {p: n for p, n in OUT.items() if p.endswith("wrench")}))
+    assert not shown.health.faults
+    np.testing.assert_allclose(shown.values["torso.position_measured"], said["torso.position_measured"])
+
+
 def test_the_robots_own_faults_and_emergency_stop_are_passed_on(puppet):
     puppet.state |= {"left_arm too hot": 1, "estop": 1}
     shown = puppet.step(4)
@@ -399,6 +505,78 @@ def test_an_image_too_old_is_not_shown(puppet):
     ticks = int(puppet.config.image_age / TICK)
     assert look(puppet, puppet.step(ticks - 2), "left_wrist").sequence == 3
     assert look(puppet, puppet.step(4), "left_wrist").sequence == -1
+
+
+def spoilt(way, data):
+    return {
+        "cut": data[: len(data) // 2],
+        "garbage": b"no image" * 50,
+        "empty": b"",
+        "of pixels only at its start": data[:-200] + bytes(200),
+    }[way]
+
+
+@pytest.mark.parametrize("way", ["cut", "garbage", "empty", "of pixels only at its start"])
+def test_an_image_that_cannot_be_decoded_is_no_news_and_a_fault_if_it_goes_on(puppet, way):
+    puppet.image("left_wrist", 0, noise(0))
+    assert look(puppet, puppet.step(), "left_wrist").sequence == 0
+    puppet.link.send(puppet.tick * TICK, values(1, IN))
+    faults = []
+    for k in range(1, 130):
+        if k % 16 == 1:
+            frame = encode_frame("left_wrist", 7 + puppet.now, k, noise(k), 90)
+            frame = dc.replace(frame, data=spoilt(way, frame.data))
+            puppet.bus.send("left_wrist.image", image_message(frame))
+        shown = puppet.step()
+        assert look(puppet, shown, "left_wrist").sequence in (0, -1)
+        puppet.link.send(puppet.tick * TICK, values(1, IN))
+        faults.append("left_wrist: an image that cannot be decoded" in shown.health.faults)
+    assert puppet.link.dropped["left_wrist"] == 9
+    assert not any(faults[:60]) and all(faults[72:])
+    assert puppet.age(shown, "left_wrist") == pytest.approx(1.0, abs=0.1), "and none of them was news"
+    puppet.image("left_wrist", 200, noise(7))
+    shown = puppet.step(4)
+    assert look(puppet, shown, "left_wrist").sequence == 200 and puppet.age(shown, "left_wrist") < 0.05
+
+
+def test_a_single_image_that_cannot_be_decoded_is_no_fault_and_its_fellow_is_not_shown(puppet):
+    for sequence, way in ((0, None), (1, "cut"), (2, None)):
+        for camera in ("head_left", "head_right"):
+            frame = encode_frame(camera, 7 + puppet.now, sequence, noise(2 * sequence + (camera == "head_left")), 90)
+            broken = way is not None and camera == "head_left"
+            frame = dc.replace(frame, data=spoilt(way, frame.data)) if broken else frame
+            puppet.bus.send(f"{camera}.image", image_message(frame))
+        seen = set()
+        for _ in range(16):
+            shown = puppet.step()
+            assert not shown.health.faults
+            left, right = (look(puppet, shown, f"head_{side}").sequence for side in ("left", "right"))
+            seen.add((left, right))
+        assert (sequence, sequence) in seen or way is not None
+        assert all(left in (right, -1) for left, right in seen)
+
+
+@pytest.mark.parametrize("size", [(10, 10), (3000, 4000), (16, 17)])
+def test_an_image_of_another_size_is_no_news(puppet, size):
+    puppet.image("left_wrist", 3, np.zeros((*size, 3), np.uint8))
+    assert look(puppet, puppet.step(), "left_wrist").sequence == -1
+    assert puppet.link.dropped == {"left_wrist": 1}
+
+
+def test_an_image_that_claims_the_right_size_and_has_another_one_is_not_decoded(puppet, monkeypatch):
+    monkeypatch.setattr(hardware, "decode_image", lambda data: pytest.fail("decoded"))
+    frame = encode_frame("left_wrist", 7 + puppet.now, 3, np.zeros((48, 64, 3), np.uint8), 90)
+    message = image_message(frame)
+    message.images[0].width = message.images[0].height = 16
+    puppet.bus.send("left_wrist.image", message)
+    assert look(puppet, puppet.step(), "left_wrist").sequence == -1
+
+
+def test_an_image_from_the_future_is_no_news(puppet):
+    puppet.step(8)
+    puppet.image("left_wrist", 3, noise(1), ago=-0.5)
+    assert look(puppet, puppet.step(), "left_wrist").sequence == -1
+    assert puppet.link.dropped == {"left_wrist": 1}
 
 
 def test_a_frozen_camera_is_silent(puppet):

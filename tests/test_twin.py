@@ -10,23 +10,38 @@ import time as wall
 
 import numpy as np
 import pytest
+from bad_messages import bad_messages, on
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
 from valve_drake import diagram, rehearsal, runner
 from valve_drake import scenario as scenarios
-from valve_drake.checks import ConfigError
+from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.messages import Mode, OperatorCommand
 from valve_drake.pace import Pacer
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
 from valve_drake.ports import SLOT, TICK
 from valve_drake.recording.reader import LogReader
+from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.contract import CAMERAS, CONTRACT
 from valve_drake.stations.faults import FaultConfig, Faults, Wire
 from valve_drake.stations.hardware import RobotLink
-from valve_drake.stations.lcm_channels import COMMANDS, CONTROLLER, LOCKSTEP_TIME, REPORTS, REQUEST, ROBOT, SYNC, Bus
+from valve_drake.stations.lcm_channels import (
+    CHANNELS,
+    COMMANDS,
+    CONTROLLER,
+    LOCKSTEP_TIME,
+    REPORTS,
+    REQUEST,
+    ROBOT,
+    STATE,
+    SYNC,
+    HardwareConfig,
+)
+from valve_drake.stations.reports import Senders
 from valve_drake.stations.twin import Guard
 
+BASE = CHANNELS["base.command"]
 ARM = "left_arm.position_command"
 SIZES = {spec.name: spec.kind for spec in CONTRACT if isinstance(spec.kind, int)}
 START = {port: np.full(size, 0.02) for port, size in SIZES.items() if "command" in port or "limit" in port}
@@ -112,6 +127,31 @@ def test_an_emergency_stop_leaves_the_fingers_to_their_commands():
     targets = guard.targets(moved, True, 1.01)
     assert targets[ARM][0] == 0.01 and targets["left_gripper.position_command"][0] == 0.07
     np.testing.assert_array_equal(targets["base.twist_command"], 0)
+
+
+@pytest.mark.parametrize(("device", "fastest"), [("left_arm", 2.5), ("right_arm", 2.5), ("torso", 2.0)])
+def test_no_joint_is_faster_than_the_robot_allows_however_far_ahead_its_commands_are(device, fastest):
+    guard = Guard(START, 0.1)
+    port = f"{device}.position_command"
+    path, measured = [START[port]], dict(MEASURED)
+    for k in range(128):
+        measured[f"{device}.position_measured"] = path[-1]
+        guard.take(f"{device}.command", {port: path[-1] + 0.45}, measured, k * TICK)
+        path.append(guard.targets(measured, False, k * TICK)[port])
+    speeds = np.diff(path, axis=0) / TICK
+    assert speeds.max() == pytest.approx(fastest) and np.all(speeds <= fastest + 1e-9)
+    assert f"{device}.command faster than the joints may move" in guard.faults(1.0)
+
+
+def test_commands_within_the_joints_speed_pass_to_the_bit():
+    guard = Guard(START, 0.1)
+    rng = np.random.default_rng(3)
+    command = START[ARM].copy()
+    for k in range(50):
+        command = command + rng.uniform(-1, 1, 6) * 1.5 * TICK * 0.999
+        guard.take("left_arm.command", {ARM: command}, MEASURED, k * TICK)
+        np.testing.assert_array_equal(guard.targets(MEASURED, False, k * TICK)[ARM], command)
+    assert not any("faster" in fault for fault in guard.faults(50 * TICK))
 
 
 # ---------------------------------------------------------------- faults
@@ -330,6 +370,151 @@ def test_in_lock_step_the_twin_ends_when_the_program_has_fallen_silent(monkeypat
     clock[0] += 1.0
     twin.poll()
     assert twin.gone
+
+
+class Commanded:
+    """A twin in one process that is told where to drive, tick by tick."""
+
+    def __init__(self):
+        self.scenario = scenarios.resolve(near("hardware.lockstep=false"))
+        self.lcm = DrakeLcm("memq://")
+        self.twin = rehearsal.make_twin(self.scenario, lcm=self.lcm)
+        self.bus = Bus(self.scenario.hardware, self.lcm)
+        self.state = {}
+        self.bus.listen(ROBOT, lambda key, message: self.state.update(state=message) if key == STATE else None)
+
+    def drive(self, *commands):
+        """A tick in which these arrive: (stamp [us], forward speed [m/s])."""
+        self.twin.report()
+        for stamp, forward in commands:
+            self.bus.send("base.command", BASE.encode(stamp, {"base.twist_command": np.array([forward, 0.0])}))
+            self.twin.hear()
+        self.twin.move()
+
+    def tick(self, count=1):
+        for _ in range(count):
+            self.twin.report()
+            self.twin.move()
+        while self.bus.pump():
+            pass
+
+    @property
+    def told(self):
+        """The base's forward speed that the twin's own side has let pass."""
+        return float(self.twin._guard.targets(self.twin._measured, False, self.twin.time)["base.twist_command"][0])
+
+    @property
+    def faults(self):
+        return set(self.state["state"].coord) - {"protocol", "estop", "torso", "left_arm", "right_arm"}
+
+
+@pytest.fixture(scope="module")
+def commanded():
+    return Commanded()
+
+
+def test_a_command_said_again_counts_as_none(commanded):
+    c = commanded
+    c.drive((1_000_000, 0.5))
+    assert c.told == 0.5
+    for _ in range(40):
+        c.drive((1_000_000, 0.5))
+    c.tick(4)
+    assert c.told == 0.0 and "base.command late" in c.faults
+    for _ in range(40):  # of another clock
+        c.drive((500, 0.5))
+    assert c.told == 0.0
+    c.drive((10_000, 0.5))  # a program that began anew
+    c.drive((20_000, 0.5))
+    assert c.told == 0.5
+
+
+def test_a_second_programs_commands_are_refused_by_their_stamps_and_reported(commanded):
+    c = commanded
+    c.tick(20)
+    for k in range(-2, 0):
+        c.drive((100_000_000 + k * 7812, 0.1))
+    for k in range(40):
+        c.drive((100_000_000 + k * 7812, 0.1), (5_000_000_000 + k * 7812, 0.7))
+    assert c.told == 0.1
+    c.tick(4)
+    assert "base.command refused: a stamp of another clock" in c.faults
+
+
+def test_commands_count_as_none_while_two_programs_say_that_they_are_there(commanded):
+    c = commanded
+    c.tick(20)
+    for bus in (Bus(c.scenario.hardware, c.lcm) for _ in range(2)):
+        bus.announce(CONTROLLER)
+    c.twin.hear()
+    c.tick(20)
+    c.drive((200_000_000, 0.5))
+    c.tick(4)
+    assert c.told == 0.0 and "base.command refused: two programs" in c.faults
+    c.twin._bus.senders = Senders()
+
+
+def test_another_robot_on_the_bus_is_reported(commanded):
+    c = commanded
+    Bus(c.scenario.hardware, c.lcm).announce(ROBOT)
+    c.twin.hear()
+    c.tick(4)
+    assert "two robots on the bus" in c.faults
+    with pytest.raises(OperationFailed, match="another robot or twin is on"):
+        c.twin.claim(lambda: False)
+    c.twin._bus.senders = Senders()
+
+
+def test_whatever_is_sent_to_the_twin_it_goes_on_and_obeys_again(commanded):
+    c = commanded
+    for k, message in enumerate(bad_messages(np.random.default_rng(5), CONTROLLER, 1500)):
+        on(c.bus, message)
+        c.twin.hear()
+        if k % 25 == 0:
+            c.tick()
+            assert np.all(np.isfinite(c.twin.read("base.odometry")))
+    assert any("does not carry" in fault for fault in c.faults)
+    for k in range(96):
+        c.drive((900_000_000 + k * 7812, 0.25))
+    c.tick(4)
+    assert c.told == 0.25 and not {fault for fault in c.faults if not fault.endswith("late")}
+
+
+def test_a_request_of_an_unknown_camera_is_none(commanded):
+    c = commanded
+    for names in ({"nose": 1.0}, {"head_left": math.nan}, {}):
+        c.bus.say(REQUEST, 0, names)
+        c.twin.hear()
+        c.tick()
+    assert c.twin._requested[1] == set()
+
+
+def test_only_signed_commands_move_a_robot_with_a_key(tmp_path):
+    (tmp_path / "key").write_text("a key that nobody else has")
+    lcm, heard = DrakeLcm("memq://"), []
+    signed = HardwareConfig(key_file=str(tmp_path / "key"))
+    robot = Bus(signed, lcm)
+    robot.listen(CONTROLLER, lambda key, message: heard.append((key, message)))
+    message = BASE.encode(7, {"base.twist_command": np.array([0.5, 0.0])})
+    packets = []
+    lcm.Subscribe("VALVE_BASE_COMMAND", packets.append)
+    Bus(HardwareConfig(), lcm).send("base.command", message)
+    robot.pump()
+    assert [type(m) for _, m in heard] == [BadMessage] and "not signed with hardware.key_file" in heard[0][1].words
+    Bus(signed, lcm).send("base.command", message)
+    robot.pump()
+    assert BASE.read(heard[-1][1])["base.twist_command"][0] == 0.5
+    lcm.Publish("VALVE_BASE_COMMAND", packets[-1])  # what somebody has recorded
+    robot.pump()
+    assert len(heard) == 2
+    assert BASE.kind.decode(packets[-1]).timestamp == 7, "and it is still Drake's message to who only looks"
+
+
+def test_first_images_that_take_long_are_told_and_can_be_stopped(monkeypatch):
+    monkeypatch.setattr("valve_drake.stations.twin.STARTING", 0.05)
+    images, told, stop = rehearsal.LiveImages(), [], iter([False] * 20 + [True])
+    images.settle(lambda: next(stop), told.append)
+    assert told == ["the twin waits for its renderers: no image yet of head_left, head_right, left_wrist, right_wrist"]
 
 
 def test_a_hardware_log_replays_to_the_bit(short):

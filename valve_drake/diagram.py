@@ -37,10 +37,10 @@ from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.recording.signals import JOINED
 from valve_drake.robot_state_system import RobotStateSystem
 from valve_drake.scenario import Scenario
+from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CONTRACT
 from valve_drake.stations.hardware import RobotLink, make_hardware_station
-from valve_drake.stations.lcm_channels import Bus
 from valve_drake.stations.replay import Recording, make_replay_station
 from valve_drake.stations.simulated import make_simulated_station
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem

@@ -8,14 +8,15 @@ from collections.abc import Callable, Iterator
 import cv2
 from pydrake.lcm import DrakeLcm
 
+from valve_drake.console import complain
 from valve_drake.diagram import initial_commands, make_station
 from valve_drake.pace import Pace, Pacer
 from valve_drake.ports import SLOT
 from valve_drake.scenario import Scenario, resolve
+from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.faults import Faults
 from valve_drake.stations.hardware import RobotLink
-from valve_drake.stations.lcm_channels import Bus
 from valve_drake.stations.twin import LiveImages, Twin
 
 
@@ -71,10 +72,12 @@ def run_twin(
     duration: float | None = None,
     show: Callable[[float], None] = lambda time: None,
     stop: Callable[[], bool] = lambda: False,
+    notice: Callable[[str], None] = complain,
 ) -> Rehearsed:
     """Runs the twin of a scenario until the program at the other end has gone, or for `duration` [s] of its time.
 
-    show: called with its time, every tick. stop: True ends it.
+    show: called with its time, every tick. stop: True ends it. notice: tells the user, one line, what takes long.
+    Raises ConfigError for a bad scenario or bus, OperationFailed if another robot is on the bus.
     """
     scenario = resolve(scenario)
     scenario.check()
@@ -83,6 +86,9 @@ def run_twin(
     with CameraWorkers() if lockstep else LiveImages() as workers:
         twin = make_twin(scenario, workers=workers)
         begin = float(twin.read("truth.valve_angle")[0])
+        if isinstance(workers, LiveImages):
+            workers.settle(stop, notice)
+        twin.claim(stop)
         pacer = None if lockstep else Pacer(idle=twin.pass_time)
         gc.collect()
         gc.freeze()

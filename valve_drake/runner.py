@@ -38,9 +38,9 @@ from valve_drake.recording.robot_frames import RobotFrames, pinholes
 from valve_drake.recording.signals import signals
 from valve_drake.recording.writer import LogError, LogWriter
 from valve_drake.scenario import Scenario, dump, parse, resolve, with_overrides
+from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.hardware import AHEAD, RobotLink
-from valve_drake.stations.lcm_channels import Bus
 from valve_drake.stations.replay import Recording
 
 STEP = 1 / 32  # between two looks at the mode [s]
@@ -155,7 +155,7 @@ def run(
     meshcat = None
     if scenario.station == "hardware":
         html = meshcat_port = None  # the simulation's views: a robot is looked at itself
-        link = link or RobotLink(Bus(scenario.hardware))
+        link = link or RobotLink(Bus(scenario.hardware), stop=stop)
     if html is not None or meshcat_port is not None:
         meshcat = Meshcat(MeshcatParams(host="localhost", port=meshcat_port))
         meshcat.SetCameraPose(np.array([-5.2, -3.6, 2.7]), np.array([-1.4, 0.1, 0.8]))  # start and valve in view

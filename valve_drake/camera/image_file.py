@@ -54,6 +54,12 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
     return image
 
 
+def jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) that the header of a JPEG claims; None for anything else. Nothing is decoded."""
+    size = _claimed_size(data)
+    return size[1:3] if size is not None and size[0] == "JPEG" else None
+
+
 def _read_bytes(path: Path, key: str) -> bytes:
     try:
         about = path.stat()

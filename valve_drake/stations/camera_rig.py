@@ -181,8 +181,16 @@ def encode_frame(camera: str, time: float, sequence: int, image: np.ndarray, qua
 
 
 def decode_image(data: bytes) -> np.ndarray:
-    """JPEG bytes -> (H, W, 3) RGB."""
-    return cv2.cvtColor(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    """JPEG bytes -> (H, W, 3) RGB. Raises ValueError if they are no whole image."""
+    try:
+        # A turn noted in the file is not applied: a calibration is about the pixels as the sensor has them.
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if b"\xff\xd9" in data else None
+    except (cv2.error, MemoryError):
+        image = None
+    if image is None:
+        raise ValueError("an image that cannot be decoded")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 @dc.dataclass(frozen=True)

@@ -22,10 +22,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from valve_drake.checks import OperationFailed
 from valve_drake.messages import CameraFrame
 from valve_drake.ports import profile
 from valve_drake.stations.camera_rig import CameraRig, Capture
-from valve_drake.stations.contract import CAMERAS
+from valve_drake.stations.contract import CAMERAS, HEAD, MATE, WRISTS
 
 WORKERS = 2
 KEPT = 8  # captures of a camera that may still be asked for
@@ -77,12 +78,12 @@ class CameraWorkers:
             self._ask(name, capture)
 
     def frame(self, name: str, capture: Capture) -> CameraFrame:
-        """The image of a capture. Raises RuntimeError if the process that makes it has ended."""
+        """The image of a capture. Raises OperationFailed if the process that makes it has ended."""
         self._ask(name, capture)
-        k = CAMERAS.index(name) ^ 1  # who reads one eye reads the other next
-        for other in self._captures[CAMERAS[k]]:
+        mate = MATE[name]  # who reads one eye reads the other next
+        for other in self._captures[mate]:
             if (other.sequence, other.time) == (capture.sequence, capture.time):
-                self._ask(CAMERAS[k], other)
+                self._ask(mate, other)
         while (name, capture.sequence) not in self._made:
             self._receive(name)
         last, stride = self._read.get(name, (capture.sequence, 0))
@@ -110,8 +111,16 @@ class CameraWorkers:
         profile.render_worker_seconds += seconds
         self._made[frame.camera, frame.sequence] = frame
 
+    def _receive_all(self) -> None:
+        """What is there; nobody waits."""
+        for name in HEAD:  # one camera of each process
+            while self._workers and self._worker(name).wire.poll():
+                self._receive(name)
+
     def _worker(self, name: str) -> _Worker:
-        return self._workers[CAMERAS.index(name) % WORKERS]
+        """One process for the left eye of each pair, one for the right."""
+        pair = HEAD if name in HEAD else WRISTS
+        return self._workers[pair.index(name)]
 
     @contextlib.contextmanager
     def _wire(self, name: str) -> Iterator[multiprocessing.connection.Connection]:
@@ -120,7 +129,8 @@ class CameraWorkers:
         try:
             yield worker.wire
         except (EOFError, OSError) as error:
-            raise RuntimeError(f"the process that renders {name} ended with code {worker.process.wait()}") from error
+            code = worker.process.wait()
+            raise OperationFailed(f"the process that renders {name} ended with code {code}") from error
 
 
 def _send(wire: multiprocessing.connection.Connection, thing: Any) -> None:

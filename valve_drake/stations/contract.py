@@ -10,7 +10,9 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, PortD
 
 from valve_drake.messages import SIDES, CameraFrame, Health
 
-CAMERAS = ("head_left", "head_right", "left_wrist", "right_wrist")
+HEAD, WRISTS = ("head_left", "head_right"), ("left_wrist", "right_wrist")
+CAMERAS = HEAD + WRISTS
+MATE = {HEAD[0]: HEAD[1], HEAD[1]: HEAD[0], WRISTS[0]: WRISTS[1], WRISTS[1]: WRISTS[0]}  # the other one of a pair
 TRUTH = "truth."
 
 

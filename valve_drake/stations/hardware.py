@@ -4,14 +4,18 @@
 the ports. `lcm_receiver` reads it in slot 3, just before the next tick; `lcm_sender` publishes the commands of a tick
 at its end. A station is alive when it is initialised: it waits there for every device's first report.
 
-A report counts as news only if its stamp is later than that of the last one, and, for what is never quite still (wrist
-sensors, cameras) or says that it moves (base, arms), only if it says something else. So a duplicate, a message
-overtaken on the way, and a frozen sensor are all silence, and silence is what `health` tells: ages by the receiver's
-clock. A report that is not finite is no news either, and a fault. A wrist sensor that is broken or has fallen silent
-reads NaN: its last word is not the present force.
+A report is news only if its stamp is later than that of the last one. Sensors with noise (wrists, cameras), and any
+device that reports a speed, must also say something else than last time. Duplicates, overtaken messages and frozen
+sensors are therefore silence, which `health` reports as age by the receiver's clock. A message that cannot be read,
+an image that cannot be decoded and a report that is not finite are dropped and counted; the first two are a fault if
+they go on, the last one at once. A wrist sensor that is broken or silent reads NaN, since its last word is not the
+present force.
 
-Time: images are stamped by the robot's clock, and are placed on this side's by the least delay that the joints' reports
-had of late.
+Drake's own LCM subscribers are not used: their Python binding keeps one message a channel until it is asked for, and
+they do not judge stamps.
+
+Time: images are stamped by the robot's clock, and are placed on this side's by the least delay that the joints'
+reports had of late.
 """
 
 import collections
@@ -19,7 +23,7 @@ import dataclasses as dc
 import functools
 import math
 import time as wall
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -27,10 +31,12 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, Diagram, LeafSystem, State
 
 from valve_drake.checks import ConfigError, OperationFailed
+from valve_drake.console import complain
 from valve_drake.messages import SIDES, CameraFrame, Health
 from valve_drake.ports import SLOT, TICK, profile
+from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rig import decode_image
-from valve_drake.stations.contract import CAMERAS, CONTRACT, station_of
+from valve_drake.stations.contract import CAMERAS, CONTRACT, HEAD, station_of
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
@@ -46,48 +52,44 @@ from valve_drake.stations.lcm_channels import (
     ROBOT,
     STATE,
     SYNC,
-    Bus,
     Values,
     WrongMessage,
     from_utime,
     read_image,
+    read_named,
     to_utime,
 )
+from valve_drake.stations.reports import BadMessages, LeastDelay, Lockstep, Stamps
 
 NEVER_STILL = tuple(row.key for row in REPORTS if row.device.endswith("wrist_sensor"))
 SPEEDS = ("base.odometry", *(f"{side}_arm.velocity_measured" for side in SIDES))  # ports that tell of motion
 MOVING = 0.005  # [rad/s, m/s]
-HEAD = ("head_left", "head_right")
+ABSURD = 1e6  # a number of a report beyond this is no measurement, in any unit of the table
 LOOKED_AT = 0.75  # after the last look at a camera it is requested for this long: a search looks twice a second [s]
-DELAYS = 2.0  # the least delay is taken over this long [s]
-RESTART = 0.5  # a stamp that goes back by more is a driver begun anew; it is reported for as long [s]
+EARLY = 0.1  # an image may be stamped so far ahead of the robot's other reports [s]
 DECODING = 5e-3  # that an image takes, with room [s]
 AHEAD = SLOT / 2  # the station is read this long before a tick, when the last one's slot 3 is done [s of the diagram]
 HEALTH_TICKS = 4  # health is reported every 1/32 s
+PATIENCE = dict.fromkeys(CAMERAS, 0.5) | {"robot": 0.1}  # of devices that do not report every tick (reports.py) [s]
+NOTICE = 2.0  # a wait for the robot that takes longer is told [s]
 
 
 @dc.dataclass
 class _Report:
     """The last news of one device."""
 
-    stamp: int  # [us] of the robot's clock
     arrival: float  # [s] of the receiver's clock
     values: Any
 
 
-@dc.dataclass
+@dc.dataclass(eq=False)
 class _Image:
     utime: int
     sequence: int
     data: bytes
     time: float  # of capture, on this side's clock [s]
-    frame: CameraFrame | None = None  # once somebody has looked
-
-    def decoded(self, camera: str) -> CameraFrame:
-        if self.frame is None:
-            with profile("images"):
-                self.frame = CameraFrame(camera, self.time, self.sequence, decode_image(self.data), self.data)
-        return self.frame
+    before: float  # when the camera's last image before this one had arrived [s, receiver's clock]
+    frame: CameraFrame | None = None  # once it was decoded; without pixels if it cannot be
 
 
 @dc.dataclass(frozen=True)
@@ -109,33 +111,61 @@ BEFORE = Snapshot(  # the station was initialised
 )
 
 
+class CameraRequests:
+    """Which cameras the robot is asked for: those that a block looked at of late."""
+
+    def __init__(self) -> None:
+        self._looked: dict[str, float] = {}  # camera -> last look [s of the diagram]
+        self.since: dict[str, float] = {}  # requested cameras -> since when [s, receiver's clock]
+
+    def look(self, camera: str, time: float) -> None:
+        """A block reads the camera's port."""
+        self._looked[camera] = time
+
+    def update(self, time: float, clock: float) -> bool:
+        """At the end of a tick -> whether the request has changed."""
+        wanted = [camera for camera, looked in self._looked.items() if time - looked <= LOOKED_AT]
+        changed = set(wanted) != set(self.since)
+        self.since = {camera: self.since.get(camera, clock) for camera in wanted}
+        return changed
+
+    def message(self) -> dict[str, float]:
+        return {camera: float(camera in self.since) for camera in CAMERAS}
+
+
 class RobotLink:
     """The program's end of the wire.
 
     idle: called while this side waits for the robot with nothing to do; a robot in the same process steps there.
+    notice: tells the user, one line, what is waited for. stop: True ends the wait for a robot.
     """
 
-    def __init__(self, bus: Bus, idle: Callable[[], None] | None = None):
+    def __init__(
+        self,
+        bus: Bus,
+        idle: Callable[[], None] | None = None,
+        *,
+        notice: Callable[[str], None] = complain,
+        stop: Callable[[], bool] = lambda: False,
+    ):
         self.bus = bus
+        self.stop = stop
         self._config = bus.config
         self._idle = idle or (lambda: wall.sleep(2e-4))
+        self._notice = notice
+        self._stamps = Stamps()
+        self._bad = BadMessages(PATIENCE)
         self._reports: dict[str, _Report] = {}
-        self._films = {camera: collections.deque(maxlen=4) for camera in CAMERAS}
+        self._delay = LeastDelay()
+        self._lockstep = Lockstep()
+        self._requests = CameraRequests()
+        self._films: dict[str, collections.deque[_Image]] = {c: collections.deque(maxlen=4) for c in CAMERAS}
         self._placed: dict[int, float] = {}  # utime of a capture -> time on this side
-        self._looked: dict[str, float] = {}  # camera -> when it was looked at last [s of the diagram]
-        self._wanted: dict[str, float] = {}  # requested cameras -> since when, receiver's clock
-        self._complaints: dict[str, tuple[str, float]] = {}  # device -> what was wrong, and when
-        self._delays: collections.deque = collections.deque()  # (time, least delay of a tick)
-        self._delay = math.inf  # the least one of this tick's reports
         self._time = 0.0  # of the tick that looks at what arrives now [s of the diagram]
-        self._heard = 0  # messages since the start of lock-step
-        self._sync = (-2, 0)  # tick, messages
-        self._sent_before = 0
         self._answered = -1  # the last tick whose commands were sent
-        self._synced = False  # the robot keeps lock-step
         self._health = Health()
-        self._told: tuple[str, int] | None = None  # mode and activation
-        self._doing: tuple[str, int] | None = None  # the same, not yet sent
+        self._sent_mode: tuple[str, int] | None = None  # mode and activation
+        self._new_mode: tuple[str, int] | None = None  # the same, to be sent with the next commands
         bus.listen(ROBOT, self._hear)
 
     # ------------------------------------------------------------ the wire
@@ -144,69 +174,74 @@ class RobotLink:
         return self._time if self._config.lockstep else wall.monotonic()
 
     def _hear(self, key: str, message: Any) -> None:
-        row = CHANNELS[key]
-        if key == SYNC[ROBOT]:
-            self._hear_sync(message)
-            return
-        self._heard += 1
-        if message is None:
-            self._complain(row.device, f"{self.bus.name(key)} does not carry {row.kind.__name__}")
+        device = CHANNELS[key].device
+        if isinstance(message, BadMessage):
+            self._bad.bad(device, message.words, self.clock())
             return
         try:
-            if row.read is not None:
-                self._take(key, getattr(message, row.stamp), row.read(message))
-            elif key == STATE:
-                self._take(key, message.timestamp, dict(zip(message.coord, message.val)))
-            else:
-                self._take_image(row.device, key, read_image(message))
+            if key == SYNC[ROBOT]:
+                if not self._lockstep.hear(message):
+                    raise WrongMessage("sync of other numbers than tick and messages")
+                return
+            self._lockstep.count()
+            self._read(key, message)
         except WrongMessage as error:
-            self._complain(row.device, f"{row.device}: {error}")
+            self._bad.bad(device, f"{device}: {error}", self.clock())
 
-    def _hear_sync(self, message: Any) -> None:
-        if message is None or message.dim != 2:
-            return
-        self._synced = True
-        self._sync = (int(message.val[0]), int(message.val[1]))
-        if self._sync[0] < 0:  # all before the start does not count
-            self._heard = 0
+    def _read(self, key: str, message: Any) -> None:
+        row = CHANNELS[key]
+        if row.read is not None:
+            self._take(key, getattr(message, row.stamp), row.read(message))
+        elif key == STATE:
+            self._take(key, message.timestamp, read_named(message))
+        elif row.device in IMAGES:
+            self._take_image(row.device, key, read_image(message, self._config.image_size))
 
-    def _take(self, key: str, stamp: int, values: Any) -> bool:
+    def _is_news(self, key: str, stamp: int) -> bool:
+        device, now = CHANNELS[key].device, self.clock()
+        verdict = self._stamps.judge(key, stamp, now)
+        if verdict == Stamps.RESTARTED:
+            self._delay.forget()
+        if verdict in (Stamps.STRANGE, Stamps.RESTARTED):
+            self._bad.bad(device, f"{device} restarted", now, at_once=verdict == Stamps.RESTARTED)
+        return verdict in (Stamps.NEWS, Stamps.RESTARTED)
+
+    def _take(self, key: str, stamp: int, values: Any) -> None:
         """Keeps a report if it is news."""
-        last = self._reports.get(key)
-        if last is not None and stamp <= last.stamp:
-            if last.stamp - stamp < 1e6 * RESTART:
-                return False  # a duplicate, or overtaken
-            self._complain(CHANNELS[key].device, f"{CHANNELS[key].device} restarted")
-            self._delays.clear()
-        arrival = self.clock()
-        if not _finite(values):
-            self._complain(CHANNELS[key].device, f"{CHANNELS[key].device}: not finite")
+        if not self._is_news(key, stamp):
+            return
+        row, last, arrival = CHANNELS[key], self._reports.get(key), self.clock()
+        if not _sound(values):
+            self._bad.bad(row.device, f"{row.device}: not finite", arrival, at_once=True)
             if last is None or key not in NEVER_STILL:
-                return False
+                return
             arrival = last.arrival  # shown all the same: what is not known must not look known
-        elif last is not None and _frozen(key, values, last.values):
-            arrival = last.arrival
-        self._reports[key] = _Report(stamp, arrival, values)
-        if CHANNELS[key].read is not None:
-            self._delay = min(self._delay, self._time - from_utime(stamp))
-        return True
+        else:
+            self._bad.good(row.device, arrival)
+            if last is not None and _frozen(key, values, last.values):
+                arrival = last.arrival
+        self._reports[key] = _Report(arrival, values)
+        if row.read is not None:
+            self._delay.add(self._time - from_utime(stamp))
 
     def _take_image(self, camera: str, key: str, image: Any) -> None:
-        film, data, last = self._films[camera], bytes(image.data), self._reports.get(key)
-        if not self._take(key, image.header.utime, None):
+        utime, data, now = image.header.utime, bytes(image.data), self.clock()
+        if not self._is_news(key, utime):
             return
+        film, last = self._films[camera], self._reports.get(key)
         if film and film[-1].data == data:  # a frozen camera has nothing to say
-            self._reports[key].arrival = last.arrival
             return
-        utime = image.header.utime
-        if utime not in self._placed:
-            self._placed[utime] = from_utime(utime) + min((d for _, d in self._delays), default=0.0)
-        film.append(_Image(utime, image.header.seq, data, self._placed[utime]))
+        least = self._delay.least()
+        if least is None:  # the robot's clock is not known
+            return
+        time = self._placed.setdefault(utime, from_utime(utime) + least)
         while len(self._placed) > 64:
             self._placed.pop(next(iter(self._placed)))
-
-    def _complain(self, device: str, words: str) -> None:
-        self._complaints[device] = (words, self.clock())
+        if time > self._time + EARLY:
+            raise WrongMessage(f"an image stamped {time - self._time:.1f} s ahead of the robot's other reports")
+        before = -math.inf if last is None else last.arrival
+        self._reports[key] = _Report(now, None)
+        film.append(_Image(utime, image.header.seq, data, time, before))
 
     def _wait(self) -> None:
         if not self.bus.pump():
@@ -216,19 +251,30 @@ class RobotLink:
     def start(self) -> Snapshot:
         """Waits for the first report of every device.
 
-        Raises OperationFailed if the robot does not answer, ConfigError if it is not the robot of this program.
+        Raises OperationFailed if the robot does not answer or another program is there, ConfigError if it is not the
+        robot of this program.
         """
         needed = [row.key for row in REPORTS] + [STATE]
+        alone = self.bus.claim(CONTROLLER)
+
+        def ready() -> bool:
+            if self.bus.others(ROBOT) > 1:
+                raise OperationFailed(f"{self.bus.others(ROBOT)} robots are on {self._config.lcm_url}: want one")
+            return alone() and (all(key in self._reports for key in needed) or bool(self._bad.words))
+
+        def missing() -> str:
+            return ", ".join(self.bus.name(key) for key in needed if key not in self._reports)
+
         self._until(
-            lambda: all(key in self._reports for key in needed) or self._complaints,
+            ready,
             self._config.answer_time,
             lambda: (
-                "the robot does not answer: nothing on "
-                + ", ".join(self.bus.name(key) for key in needed if key not in self._reports)
-                + f" within {self._config.answer_time:g} s"
+                f"the robot does not answer: nothing on {missing()} within {self._config.answer_time:g} s"
+                + self.bus.excuse()
             ),
+            lambda: f"waiting up to {self._config.answer_time:g} s for the robot: nothing yet on {missing()}",
         )
-        for words, _ in self._complaints.values():
+        for words in self._bad.words.values():
             raise ConfigError(f"not the robot of this program: {words}")
         state = self._reports[STATE].values
         if state.get("protocol") != PROTOCOL:
@@ -239,40 +285,54 @@ class RobotLink:
                 raise ConfigError(f"the robot's {device} has {state.get(device, math.nan):g} joints, want {count}")
         if self._config.lockstep:
             self._start_lockstep()
-        elif self._synced:
+        elif self._lockstep.tick is not None:
             raise ConfigError("the robot runs in lock-step, this program does not: hardware.lockstep")
         return self._look()
 
-    def _until(self, done: Callable[[], Any], seconds: float, failure: Callable[[], str]) -> None:
-        end = wall.monotonic() + seconds
+    def _until(
+        self,
+        done: Callable[[], Any],
+        seconds: float,
+        failure: Callable[[], str],
+        waiting: Callable[[], str] | None = None,
+    ) -> None:
+        """Raises OperationFailed with `failure` after some seconds. waiting: tells the user, and may be stopped."""
+        begin, told = wall.monotonic(), False
         while not done():
-            if wall.monotonic() > end:
+            passed = wall.monotonic() - begin
+            if passed > seconds:
                 raise OperationFailed(failure())
+            if waiting is not None and self.stop():
+                raise OperationFailed("stopped by the operator before the robot had answered")
+            if waiting is not None and not told and passed > NOTICE:
+                told = True
+                self._notice(waiting())
             self._wait()
 
     def _start_lockstep(self) -> None:
         self._until(
-            lambda: self._synced,
+            lambda: self._lockstep.tick is not None,
             self._config.answer_time,
             lambda: "the robot does not run in lock-step, this program does",
+            lambda: f"waiting for lock-step: nothing yet on {self.bus.name(SYNC[ROBOT])}",
         )
-        self._sent_before = self.bus.sent
+        self._lockstep.begin(self.bus.sent)
         self._send_sync(-1)
         self._await_tick(0)
 
     def _await_tick(self, tick: int) -> None:
         """Lock-step: until all that the robot sent for this tick is here."""
         self._until(
-            lambda: self._sync == (tick, self._heard),
+            lambda: self._lockstep.complete(tick),
             LOCKSTEP_TIME,
             lambda: (
                 f"lock-step: the robot's tick {tick} did not arrive within {LOCKSTEP_TIME:g} s; "
-                f"at tick {self._sync[0]} with {self._heard} of {self._sync[1]} messages"
+                + self._lockstep.progress()
             ),
         )
 
     def _send_sync(self, tick: int) -> None:
-        self.bus.say(SYNC[CONTROLLER], 0, {"tick": tick, "messages": self.bus.sent - self._sent_before})
+        self.bus.say(SYNC[CONTROLLER], 0, self._lockstep.announcement(tick, self.bus.sent))
 
     # ------------------------------------------------------------ every tick
     def update(self, time: float) -> Snapshot:
@@ -286,10 +346,7 @@ class RobotLink:
 
     def _look(self) -> Snapshot:
         now, time = self.clock(), self._time
-        if math.isfinite(self._delay):
-            self._delays.append((time, self._delay))
-        while self._delays and time - self._delays[0][0] > DELAYS:
-            self._delays.popleft()
+        self._delay.close(time)
         values: Values = {}
         for row in REPORTS:
             report = self._reports[row.key]
@@ -297,19 +354,21 @@ class RobotLink:
             values |= {port: np.full_like(v, np.nan) for port, v in report.values.items()} if silent else report.values
         if round(time / TICK) % HEALTH_TICKS == 0:
             self._health = self._diagnose(now, time)
-        self._time, self._delay = self._time + TICK, math.inf
+        self._time = time + TICK
         return Snapshot(values, self._shown(time), self._health)
 
     def _diagnose(self, now: float, time: float) -> Health:
         ages = [now - self._reports[row.key].arrival for row in REPORTS]
         for camera, row in IMAGES.items():
-            since = self._wanted.get(camera)
+            since = self._requests.since.get(camera)
             last = self._reports[row.key].arrival if row.key in self._reports else -math.inf
             ages.append(0.0 if since is None else now - max(since, last))
         ages.append(now - self._reports[STATE].arrival)
         state = self._reports[STATE].values
         faults = [name for name, value in state.items() if name not in ("protocol", "estop", *JOINTS) and value]
-        faults += [words for words, when in self._complaints.values() if now - when <= RESTART]
+        faults += self._bad.faults(now)
+        faults += ["another program commands this robot"] if self.bus.others(CONTROLLER) else []
+        faults += ["two robots on the bus"] if self.bus.others(ROBOT) > 1 else []
         return Health(
             time=time, devices=DEVICES, ages=np.array(ages), faults=tuple(faults), estop=bool(state.get("estop", 1))
         )
@@ -327,21 +386,47 @@ class RobotLink:
 
     def look(self, camera: str, image: _Image | None, time: float) -> CameraFrame:
         """What a reader of the camera's port gets; the camera is requested from then on."""
-        self._looked[camera] = time
-        return CameraFrame(camera=camera) if image is None else image.decoded(camera)
+        self._requests.look(camera, time)
+        return CameraFrame(camera=camera) if image is None else self._decoded(camera, image)
+
+    def _decoded(self, camera: str, image: _Image) -> CameraFrame:
+        """The image, or one without pixels if it cannot be decoded: then it was no news."""
+        if image.frame is None:
+            with profile("images"):
+                image.frame = self._decode(camera, image)
+        return image.frame
+
+    def _decode(self, camera: str, image: _Image) -> CameraFrame:
+        try:
+            pixels = decode_image(image.data)
+            if pixels.shape[1::-1] != tuple(self._config.image_size):
+                raise ValueError("an image of another size than its header says")
+        except ValueError as error:
+            self._bad.bad(camera, f"{camera}: {error}", self.clock())
+            film, report = self._films[camera], self._reports[IMAGES[camera].key]
+            if film and film[-1].utime == image.utime:
+                report.arrival = image.before
+            for later in film:
+                later.before = image.before if later.utime > image.utime else later.before
+            kept = [other for other in film if other.utime != image.utime]
+            film.clear()
+            film.extend(kept)
+            return CameraFrame(camera=camera)
+        self._bad.good(camera, self.clock())
+        return CameraFrame(camera, image.time, image.sequence, pixels, image.data)
 
     def send(self, time: float, commands: Values) -> None:
         """Publishes the commands of the tick that began at `time`."""
         stamp = to_utime(time)
         for row in COMMANDS:
             self.bus.send(row.key, row.encode(stamp, commands))
-        wanted = {camera for camera, looked in self._looked.items() if time - looked <= LOOKED_AT}
-        if wanted != set(self._wanted) or round(time / TICK) % round(self._config.request_period / TICK) == 0:
-            self._wanted = {camera: self._wanted.get(camera, self.clock()) for camera in wanted}
-            self.bus.say(REQUEST, stamp, {camera: camera in wanted for camera in CAMERAS})
-        if self._doing is not None:
-            self.bus.say(MODE, stamp, dict([self._doing]))
-            self._doing = None
+        changed = self._requests.update(time, self.clock())
+        if changed or round(time / TICK) % round(self._config.request_period / TICK) == 0:
+            self.bus.say(REQUEST, stamp, self._requests.message())
+        if self._new_mode is not None:
+            self.bus.say(MODE, stamp, dict([self._new_mode]))
+            self._new_mode = None
+        self.bus.announce(CONTROLLER)
         if self._config.lockstep:
             self._answered = round(time / TICK)
             self._send_sync(self._answered)
@@ -350,26 +435,32 @@ class RobotLink:
         """Listens while there is nothing else to do, since a channel has room for one message; decodes images ahead."""
         wall.sleep(min(seconds, 2e-3))
         self.bus.pump()
-        fresh = (c for c in self._wanted if self._films[c] and self._films[c][-1].frame is None)
+        fresh = (c for c in self._requests.since if self._films[c] and self._films[c][-1].frame is None)
         if seconds > DECODING and (camera := next(fresh, None)):
-            self._films[camera][-1].decoded(camera)
+            self._decoded(camera, self._films[camera][-1])
 
     def tell(self, mode: str, activation: int) -> None:
         """Tells the robot's side what the program is doing, with the next commands."""
-        if (mode, activation) != self._told:
-            self._told = self._doing = (mode, activation)
+        if (mode, activation) != self._sent_mode:
+            self._sent_mode = self._new_mode = (mode, activation)
 
     def leave(self) -> None:
         """Lock-step: the robot need not wait any longer. It is told when it has answered the last tick: a channel has
         room for one message."""
         if self._config.lockstep:
-            if self._sync[0] == self._answered:
+            if self._lockstep.tick == self._answered:
                 self._await_tick(self._answered + 1)
             self._send_sync(-2)
 
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """How many messages of each device were dropped so far."""
+        return self._bad.counts
 
-def _finite(values: Values | None) -> bool:
-    return values is None or all(np.isfinite(value).all() for value in values.values())
+
+def _sound(values: Values | Mapping[str, float] | None) -> bool:
+    """All numbers are finite, and such as something measured can be."""
+    return values is None or all(bool(np.all(np.abs(value) <= ABSURD)) for value in values.values())
 
 
 def _frozen(key: str, values: Values | None, last: Values | None) -> bool:

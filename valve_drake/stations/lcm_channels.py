@@ -1,11 +1,12 @@
 """What travels between the program and a robot: one table of LCM channels, in Drake's own message types.
 
-`CHANNELS` is all that a driver's author needs; docs/hardware.md shows it as `table()` makes it. `Bus` puts it on the
+`CHANNELS` is all that a driver's author needs; docs/hardware.md shows it as `table()` makes it. bus.py puts it on the
 wire. The scenario's key `hardware` names the channels, the bus and the times that are kept.
 """
 
 import dataclasses as dc
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,20 +21,25 @@ from drake import (
     lcmt_schunk_wsg_command,
     lcmt_schunk_wsg_status,
 )
-from pydrake.lcm import DrakeLcm
 
+from valve_drake.camera.image_file import jpeg_size
 from valve_drake.checks import require, require_in
-from valve_drake.messages import REMEMBERED, SIDES, CameraFrame
+from valve_drake.messages import REMEMBERED, SIDES, CameraFrame, Mode
 from valve_drake.ports import SLOT, TICK
 from valve_drake.stations.contract import CAMERAS
+from valve_drake.stations.network import LOOPBACK, NAME, group_of
 
 PROTOCOL = 1  # version of this table; a robot that speaks another one is refused
 ROBOT, CONTROLLER = "robot", "controller"  # who sends
 MODE, REQUEST, STATE = "controller.mode", "cameras.request", "robot.state"
 SYNC = {ROBOT: "robot.sync", CONTROLLER: "controller.sync"}
+PRESENCE = {ROBOT: "robot.presence", CONTROLLER: "controller.presence"}
+UNCOUNTED = frozenset((*SYNC.values(), *PRESENCE.values()))  # that lock-step's count of messages leaves out
 JOINTS = {"torso": 3, "left_arm": 6, "right_arm": 6}  # of a device: how many
 LOCKSTEP_TIME = 60.0  # lock-step: how long either side may think about one tick [s, wall]
 MM = 1e3  # Drake's gripper messages are in mm
+MOST_NAMES, LONGEST_NAME = 64, 200  # of a message of named numbers
+MOST_SCANS = 20  # of a progressive JPEG: each costs a pass over the image; encoders write about 10
 
 Values = dict[str, np.ndarray]  # port of the contract -> its vector
 
@@ -221,7 +227,8 @@ def _rows() -> Iterable[Channel]:
     for camera in CAMERAS:
         yield Channel(
             f"{camera}.image", ROBOT, lcmt_image_array, "while requested, every capture",
-            "one image: JPEG, RGB, 640x480; images[0].header.seq counts captures from 0, .utime is when it was taken; "
+            "one image: JPEG, RGB, of hardware.image_size; images[0].header.seq counts captures from 0, .utime is when "
+            "it was taken; "
             "both eyes of the head are captured at once and carry the same utime", stamp="",
         )  # fmt: skip
     yield Channel(
@@ -240,8 +247,14 @@ def _rows() -> Iterable[Channel]:
     )  # fmt: skip
     for sender in (ROBOT, CONTROLLER):
         yield Channel(
+            PRESENCE[sender], sender, lcmt_drake_signal, "every 1/8 s",
+            "instance: a random number of this process, so that two of them on one bus are noticed; a robot may leave "
+            "it out", stamp="timestamp",
+        )  # fmt: skip
+        yield Channel(
             SYNC[sender], sender, lcmt_drake_signal, "lock-step only, last in every tick",
-            "tick: -1 before the start; messages: how many of this table were sent since the start", stamp="timestamp",
+            "tick: -1 before the start; messages: how many of this table were sent since the start, but for sync and "
+            "presence", stamp="timestamp",
         )  # fmt: skip
 
 
@@ -270,8 +283,11 @@ class HardwareConfig:
     channels: dict[str, str] = dc.field(
         default_factory=lambda: {row.key: row.default_name for row in CHANNELS.values()}
     )
+    network: str = LOOPBACK  # interface that the group of lcm_url must be routed to; lo: only this machine is heard
+    key_file: str = ""  # holds the key that signs all messages, the same on both sides; "": they are not signed
+    image_size: list[int] = dc.field(default_factory=lambda: [640, 480])  # of every camera; others are refused [px]
     lockstep: bool = False  # both sides wait for each other instead of the clock: for rehearsals
-    answer_time: float = 5.0  # a robot that has not reported everything after this long does not answer [s]
+    answer_time: float = 30.0  # a robot that has not reported everything after this long does not answer [s]
     report_age: float = 0.1  # a wrist sensor silent for longer reads NaN [s]
     image_age: float = 0.8  # an image older than this is not shown [s]
     command_age: float = 0.1  # on the robot: without commands for longer its joints stop [s]
@@ -279,14 +295,18 @@ class HardwareConfig:
     request_period: float = 1 / 32  # of cameras.request [s]
 
     def check(self) -> None:
-        require(self.lcm_url.partition("://")[0] in ("udpm", "memq"), "hardware.lcm_url", "udpm://... or memq://",
-                self.lcm_url)  # fmt: skip
+        group_of(self.lcm_url)
+        require(bool(NAME.fullmatch(self.network)), "hardware.network", "the name of a network interface", self.network)
+        size = self.image_size
+        good = len(size) == 2 and all(isinstance(n, int) and 1 <= n <= 4096 for n in size)
+        require(good, "hardware.image_size", "width and height, each within [1, 4096] px", size)
         unknown = sorted(set(self.channels) - set(CHANNELS))
         require(not unknown, "hardware.channels", f"keyed by {', '.join(CHANNELS)}", ", ".join(unknown))
         names = list(self.channels.values())
         twice = sorted({name for name in names if names.count(name) > 1 or not name})
         require(not twice, "hardware.channels", "a name of its own for each channel", ", ".join(twice))
-        for key in ("answer_time", "report_age", "command_age"):
+        require_in(self.answer_time, TICK, 600.0, "hardware.answer_time")
+        for key in ("report_age", "command_age"):
             require_in(getattr(self, key), TICK, 60.0, f"hardware.{key}")
         require_in(self.image_age, TICK, REMEMBERED, "hardware.image_age")
         for key in ("robot_period", "request_period"):
@@ -321,53 +341,51 @@ def image_message(frame: CameraFrame) -> lcmt_image_array:
     return message
 
 
-def read_image(message: lcmt_image_array) -> lcmt_image:
-    """The only image of a message. Raises WrongMessage."""
+def read_image(message: lcmt_image_array, size: Sequence[int]) -> lcmt_image:
+    """The only image of a message, of (width, height) `size` by its header. Raises WrongMessage."""
     _count(1, message.num_images, "images")
     image = message.images[0]
     if image.compression_method != image.COMPRESSION_METHOD_JPEG:
         raise WrongMessage("an image that is not JPEG")
+    if image.header.seq < 0:
+        raise WrongMessage(f"image {image.header.seq}, want 0 or more")
+    data = bytes(image.data)
+    for found in ((image.width, image.height), jpeg_size(data)):
+        if found is None:
+            raise WrongMessage("an image that cannot be decoded")
+        if found != tuple(size):
+            raise WrongMessage(f"an image of {found[0]}x{found[1]}, want {size[0]}x{size[1]}")
+    if data.count(b"\xff\xda") > MOST_SCANS:
+        raise WrongMessage(f"a JPEG of more than {MOST_SCANS} scans")
     return image
 
 
-class Bus:
-    """One side's ends of all channels.
-
-    heard(key, message): called from `pump` for what the other side sent; the message is None if it is of another type.
-    """
-
-    def __init__(self, config: HardwareConfig, lcm: DrakeLcm | None = None):
-        self.config = config
-        self.lcm = DrakeLcm(config.lcm_url) if lcm is None else lcm
-        self.sent = 0  # messages, those of SYNC left out
-        self._names = {key: config.channels.get(key, row.default_name) for key, row in CHANNELS.items()}
-
-    def listen(self, sender: str, heard: Callable[[str, Any], None]) -> None:
-        """Hears all that `sender` says."""
-        for row in CHANNELS.values():
-            if row.sender == sender:
-                self.lcm.Subscribe(self._names[row.key], lambda data, row=row: heard(row.key, _decoded(row, data)))
-
-    def send(self, key: str, message: Any) -> None:
-        self.lcm.Publish(self._names[key], message.encode())
-        self.sent += key not in SYNC.values()
-
-    def say(self, key: str, utime: int, values: Mapping[str, float]) -> None:
-        """Named numbers on a channel."""
-        message = signal(values)
-        message.timestamp = utime
-        self.send(key, message)
-
-    def pump(self) -> bool:
-        """Hands out what has arrived -> whether there was any."""
-        return self.lcm.HandleSubscriptions(0) > 0
-
-    def name(self, key: str) -> str:
-        return self._names[key]
+def read_named(message: lcmt_drake_signal) -> dict[str, float]:
+    """Named numbers. Raises WrongMessage if there are absurdly many, or names of absurd length."""
+    if message.dim > MOST_NAMES or any(len(name) > LONGEST_NAME for name in message.coord):
+        raise WrongMessage(f"more than {MOST_NAMES} values, or names of more than {LONGEST_NAME} characters")
+    return dict(zip(message.coord, message.val))
 
 
-def _decoded(row: Channel, data: bytes) -> Any | None:
-    try:
-        return row.kind.decode(data)
-    except Exception:  # ValueError for another type; damaged bytes make a decoder raise anything
-        return None
+def read_request(message: lcmt_drake_signal) -> set[str]:
+    """The cameras that are wanted. Raises WrongMessage."""
+    values = read_named(message)
+    if not set(values) <= set(CAMERAS) or not all(value in (0.0, 1.0) for value in values.values()):
+        raise WrongMessage(f"a request of other cameras than {', '.join(CAMERAS)}, or not by 0 and 1")
+    return {camera for camera, value in values.items() if value}
+
+
+def read_mode(message: lcmt_drake_signal) -> str:
+    """The program's mode. Raises WrongMessage."""
+    names = list(read_named(message))
+    if len(names) != 1 or names[0] not in set(Mode):
+        raise WrongMessage("not one mode of the supervisor")
+    return names[0]
+
+
+def read_presence(message: lcmt_drake_signal) -> float:
+    """The sender's number. Raises WrongMessage."""
+    number = read_named(message).get("instance", math.nan)
+    if not 0 < number < 2.0**53:
+        raise WrongMessage("no instance")
+    return number

@@ -4,17 +4,19 @@ What a robot's own side does, whatever the program asks:
 
 - commands older than `hardware.command_age`: the base stops, joints hold where they were measured, fingers stay; with
   new commands the joints go to them slowly;
-- a command that is not finite or absurd is refused, and counts as none;
+- a command that is not finite or absurd, or whose stamp is not later than the last one's, counts as none;
+- no joint is faster than the robot's own limit, however far ahead its command is;
+- the commands of two programs at once count as none;
 - the emergency stop stops base and joints and leaves the fingers to their commands, so that a hand can be opened.
 
-The first two are reported as faults, the stop as such. The twin's time is its own: paced by the wall's clock, or in
+All but the stop are reported as faults, the stop as such. The twin's time is its own: paced by the wall's clock, or in
 lock-step with the program.
 """
 
 import math
 import os
 import time as wall
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -25,9 +27,10 @@ from pydrake.systems.framework import Diagram
 from valve_drake.messages import CameraFrame
 from valve_drake.motion import slew
 from valve_drake.ports import SLOT, TICK
+from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rig import Capture
 from valve_drake.stations.camera_workers import CameraWorkers
-from valve_drake.stations.contract import CAMERAS, CONTRACT
+from valve_drake.stations.contract import CAMERAS, CONTRACT, MATE
 from valve_drake.stations.faults import Faults, Wire
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
@@ -43,14 +46,16 @@ from valve_drake.stations.lcm_channels import (
     ROBOT,
     STATE,
     SYNC,
-    Bus,
     HardwareConfig,
     Values,
     WrongMessage,
     image_message,
+    read_mode,
+    read_request,
     signal,
     to_utime,
 )
+from valve_drake.stations.reports import BadMessages, Lockstep, Stamps
 from valve_drake.stations.simulation_config import CameraConfig
 
 VECTORS = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and isinstance(spec.kind, int))
@@ -59,9 +64,14 @@ REQUEST_AGE = 0.5  # of a camera request before the cameras stop [s]
 FAR = 0.5  # from the measured position, a joint's command is absurd [rad]
 FAST = (2.0, 3.0)  # base twist that is absurd [m/s, rad/s]
 GRIP = (0.2, 200.0)  # opening and force that are absurd [m, N]
+ARM_SPEED = (1.5, 1.5, 1.5, 2.5, 2.5, 2.5)
+SPEED = {"torso": (1.0, 2.0, 2.0), "left_arm": ARM_SPEED, "right_arm": ARM_SPEED}  # of the joints, at most [rad/s]
+BEHIND = 0.1  # a joint whose limited motion is farther behind its command is reported [rad]
 BACK = 0.3  # speed of a joint that was stopped, back to its commands [rad/s]
 GONE = 3.0  # paced: a program that was silent for so long has gone [s]
 IDLE = 0.05  # lock-step: between two reports before the start [s, wall]
+PATIENCE = {"cameras": 0.1, "controller": math.inf}  # of what does not come every tick (reports.py) [s]
+STARTING = 3.0  # the first images take longer on a busy machine: it is told [s]
 
 
 class LiveImages(CameraWorkers):
@@ -70,36 +80,38 @@ class LiveImages(CameraWorkers):
     def __init__(self) -> None:
         super().__init__()
         self.wanted: set[str] = set()
+        self._unmade = set(CAMERAS)  # whose first image, that nobody has asked for, is not there yet
 
-    def start(self, *rig: object) -> "LiveImages":
-        super().start(*rig)
+    def settle(self, stop: Callable[[], bool], notice: Callable[[str], None]) -> None:
+        """Waits for the first images, which take a renderer seconds, or until `stop`. notice: tells the user."""
+        begin, told = wall.monotonic(), False
+        while self._unmade and not stop():
+            self.ready()
+            wall.sleep(0.01)
+            if not told and wall.monotonic() - begin > STARTING:
+                told = True
+                missing = ", ".join(camera for camera in CAMERAS if camera in self._unmade)
+                notice(f"the twin waits for its renderers: no image yet of {missing}")
         if hasattr(os, "SCHED_IDLE"):  # Linux: rather a late image than a late tick of either side
             for worker in self._workers:
                 os.sched_setscheduler(worker.process.pid, os.SCHED_IDLE, os.sched_param(0))
-        return self
 
     def captured(self, name: str, capture: Capture) -> None:
-        if capture.sequence == 0:  # the first image takes a renderer seconds, and nobody has asked for it
-            self._ask(name, capture)
-            while (name, 0) not in self._made:
-                self._receive(name)
-            del self._asked[name][0], self._made[name, 0]
-            return
         # A camera that cannot keep up drops images; the two of a pair drop the same ones.
-        mate = CAMERAS[CAMERAS.index(name) ^ 1]
-        if name in self.wanted and (capture.sequence in self._asked[mate] or not self._asked[name] | self._asked[mate]):
+        free = not self._asked[name] | self._asked[MATE[name]]
+        if capture.sequence == 0 or (name in self.wanted and (capture.sequence in self._asked[MATE[name]] or free)):
             self._ask(name, capture)
 
     def ready(self) -> list[CameraFrame]:
         """Those that came since the last call."""
-        for name in CAMERAS[:2]:
-            while self._workers and self._worker(name).wire.poll():
-                self._receive(name)
+        self._receive_all()
         frames = list(self._made.values())
         for frame in frames:
             del self._asked[frame.camera][frame.sequence]
+            if frame.sequence == 0:
+                self._unmade.discard(frame.camera)
         self._made.clear()
-        return frames
+        return [frame for frame in frames if frame.sequence > 0]
 
 
 class Guard:
@@ -108,18 +120,24 @@ class Guard:
     def __init__(self, start: Mapping[str, np.ndarray], age: float):
         """start: port -> vector: what holds until the first command. age: of commands [s]."""
         self._told = dict(start)
+        self._targets = dict(start)  # what the joints were told last
+        self._behind: set[str] = set()  # channels whose command is farther ahead than the joints' speed allows
         self._arrived: dict[str, float] = {}
-        self._stopped: dict[str, Values] = {}  # channel -> what its device holds meanwhile
+        self._stopped: set[str] = set()  # channels whose joints hold, or are on their way back to their commands
         self._refused: dict[str, tuple[str, float]] = {}
         self._age = age
 
     def take(self, key: str, values: Values, measured: Values, time: float) -> None:
         """A command that has arrived."""
         if problem := _problem(CHANNELS[key].device, values, measured):
-            self._refused[key] = (problem, time)
+            self.refuse(key, problem, time)
             return
         self._told |= values
         self._arrived[key] = time
+
+    def refuse(self, key: str, problem: str, time: float) -> None:
+        """A command that counts as none."""
+        self._refused[key] = (problem, time)
 
     def _late(self, key: str, time: float) -> bool:
         return time - self._arrived.get(key, time) > self._age
@@ -129,27 +147,40 @@ class Guard:
 
         A joint that was stopped goes slowly to where it is commanded afterwards, however far that is by then.
         """
+        targets = dict(self._told)
         for row in COMMANDS:
             if row.device.endswith("gripper"):
                 continue
             stop = estop or self._late(row.key, time)
             if row.device == "base":
-                self._stopped[row.key] = {"base.twist_command": np.zeros(2)} if stop else {}
+                targets["base.twist_command"] = np.zeros(2) if stop else self._told["base.twist_command"]
                 continue
             port = f"{row.device}.position_"
-            held = self._stopped.get(row.key, {}).get(port + "command")
-            if stop and held is None:
-                held = measured[port + "measured"]
-            elif not stop and held is not None:
-                held = slew(held, self._told[port + "command"], BACK * TICK)
-                held = None if np.array_equal(held, self._told[port + "command"]) else held
-            self._stopped[row.key] = {} if held is None else {port + "command": held}
-        return {port: value for values in (self._told, *self._stopped.values()) for port, value in values.items()}
+            goal, stopped = self._told[port + "command"], row.key in self._stopped
+            if stop:
+                target = self._targets[port + "command"] if stopped else measured[port + "measured"]
+                self._stopped.add(row.key)
+            else:
+                target = _bounded(self._targets[port + "command"], goal, BACK if stopped else SPEED[row.device])
+                if stopped and np.array_equal(target, goal):
+                    self._stopped.discard(row.key)
+                behind = not stopped and np.max(np.abs(goal - target)) > BEHIND
+                (self._behind.add if behind else self._behind.discard)(row.key)
+            targets[port + "command"] = target
+        self._targets = targets
+        return targets
 
     def faults(self, time: float) -> list[str]:
         """What the robot says of the commands."""
         words = [f"{row.key} late" for row in COMMANDS if self._late(row.key, time)]
+        words += [f"{row.key} faster than the joints may move" for row in COMMANDS if row.key in self._behind]
         return words + [f"{key} refused: {p}" for key, (p, when) in self._refused.items() if time - when <= FAULT_TIME]
+
+
+def _bounded(value: np.ndarray, goal: np.ndarray, speed: float | tuple[float, ...]) -> np.ndarray:
+    """One tick from `value` towards `goal`; a goal within reach is met to the bit."""
+    step = np.asarray(speed) * TICK
+    return np.where(np.abs(goal - value) <= step, goal, slew(value, goal, step))
 
 
 def _problem(device: str, values: Values, measured: Values) -> str:
@@ -196,12 +227,12 @@ class Twin:
         self._out = Wire(faults, self._bus.send, newest)
         self._in = Wire(faults, self._obey, newest)
         self._guard = Guard(start, hardware.command_age)
+        self._stamps = Stamps(quiet=hardware.command_age)
+        self._bad = BadMessages(PATIENCE)
         self._requested: tuple[float, set[str]] = (-math.inf, set())
         self._shown = dict.fromkeys(CAMERAS, -1)  # sequence sent last
-        self._heard = 0  # messages since the start of lock-step
-        self._heard_at = math.inf  # wall time of the last one
-        self._sync = (-3, 0)
-        self._sent_before = 0
+        self._lockstep = Lockstep()
+        self._heard_at = math.inf  # wall time of the last message
         self._started = not hardware.lockstep
         self._idle_at = -math.inf
         self._bus.listen(CONTROLLER, self._hear)
@@ -224,27 +255,42 @@ class Twin:
 
     # ------------------------------------------------------------ what it hears
     def _hear(self, key: str, message: Any) -> None:
-        self._heard_at = wall.monotonic()
-        if key == SYNC[CONTROLLER]:
-            self._sync = (int(message.val[0]), int(message.val[1]))
+        device = CHANNELS[key].device
+        if isinstance(message, BadMessage):
+            self._bad.bad(device, message.words, self.time)
             return
-        self._heard += 1
-        if message is not None:
+        self._heard_at = wall.monotonic()
+        if key != SYNC[CONTROLLER]:
+            self._lockstep.count()
             self._in.put(key, message, self.time)
+        elif not self._lockstep.hear(message):
+            self._bad.bad(device, f"{self._bus.name(key)}: other numbers than tick and messages", self.time)
 
     def _obey(self, key: str, message: Any) -> None:
         """A message that has come through the wire."""
-        if self.faults.silent(CHANNELS[key].device, self.time):
+        row = CHANNELS[key]
+        if self.faults.silent(row.device, self.time):
             return
-        if key == REQUEST:
-            self._requested = (self.time, {name for name, value in zip(message.coord, message.val) if value})
-        elif key == MODE:
-            self.faults.enter(message.coord[0], self.time)
-        else:
-            try:
-                self._guard.take(key, CHANNELS[key].read(message), self._measured, self.time)
-            except WrongMessage:
-                pass  # counts as none
+        try:
+            if key == REQUEST:
+                self._requested = (self.time, read_request(message))
+            elif key == MODE:
+                self.faults.enter(read_mode(message), self.time)
+            else:
+                self._command(key, row.read(message), getattr(message, row.stamp))
+            self._bad.good(row.device, self.time)
+        except WrongMessage as error:
+            self._bad.bad(row.device, f"{self._bus.name(key)}: {error}", self.time)
+
+    def _command(self, key: str, values: Values, stamp: int) -> None:
+        if self._bus.others(CONTROLLER) > 1:
+            self._guard.refuse(key, "two programs", self.time)
+            return
+        verdict = self._stamps.judge(key, stamp, self.time)
+        if verdict == Stamps.STRANGE:
+            self._guard.refuse(key, "a stamp of another clock", self.time)
+        elif verdict != Stamps.OLD:
+            self._guard.take(key, values, self._measured, self.time)
 
     # ------------------------------------------------------------ one tick
     def report(self) -> None:
@@ -261,11 +307,15 @@ class Twin:
             self._put_image(frame, time)
         if self.tick % round(self._hardware.robot_period / TICK) == 0 and not self.faults.silent("robot", time):
             state = {"protocol": PROTOCOL, **JOINTS, "estop": self.faults.acts("estop", "robot", time)}
-            state |= dict.fromkeys(self._guard.faults(time), 1.0)
+            words = [*self._guard.faults(time), *self._bad.faults(time)]
+            state |= dict.fromkeys(words, 1.0)
+            if self._bus.others(ROBOT):
+                state["two robots on the bus"] = 1.0
             message = signal(state)
             message.timestamp = to_utime(self.faults.clock("robot", time))
             self._say(STATE, message)
         self._out.pass_on(time)
+        self._bus.announce(ROBOT)
         if self._started:
             self.simulator.AdvanceTo(time + 3 * SLOT)  # what does not depend on the answer
 
@@ -318,21 +368,29 @@ class Twin:
         self.simulator.AdvanceTo(time + TICK)
         self.tick += 1
 
+    # ------------------------------------------------------------ the start
+    def claim(self, stop: Callable[[], bool]) -> None:
+        """Makes sure that this is the only robot on the bus. Raises OperationFailed if it is not."""
+        alone = self._bus.claim(ROBOT)
+        while not (alone() or stop()):
+            self.pass_time(2e-3)
+
     # ------------------------------------------------------------ lock-step
     def poll(self) -> None:
         """Lock-step: does what can be done now, without waiting for the program."""
         self._bus.pump()
         if not self._started:
-            if self._sync[0] == -1:
-                self._started, self._sent_before, self._heard = True, self._bus.sent, 0
+            if self._lockstep.tick == -1:
+                self._started = True
+                self._lockstep.begin(self._bus.sent)
                 self._report_tick()
             elif wall.monotonic() - self._idle_at > IDLE:
                 self._idle_at = wall.monotonic()
                 self.report()
                 self._bus.say(SYNC[ROBOT], 0, {"tick": -1, "messages": 0})
-        elif self._sync[0] == -2 or wall.monotonic() - self._heard_at > LOCKSTEP_TIME:
+        elif self._lockstep.tick == -2 or wall.monotonic() - self._heard_at > LOCKSTEP_TIME:
             self.gone = True
-        elif self._sync == (self.tick, self._heard):
+        elif self._lockstep.complete(self.tick):
             self.move()
             self._report_tick()
 
@@ -345,8 +403,7 @@ class Twin:
 
     def _report_tick(self) -> None:
         self.report()
-        sent = self._bus.sent - self._sent_before
-        self._bus.say(SYNC[ROBOT], to_utime(self.time), {"tick": self.tick, "messages": sent})
+        self._bus.say(SYNC[ROBOT], to_utime(self.time), self._lockstep.announcement(self.tick, self._bus.sent))
 
     # ------------------------------------------------------------ paced
     def pass_time(self, seconds: float) -> None:
