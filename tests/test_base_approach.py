@@ -23,11 +23,13 @@ from valve_drake.messages import (
     StereoPosition,
     Verdict,
 )
+from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK
 
 DT = 1 / 64  # half the real rate: the laws do not depend on it, and the tests are quicker
 CONFIG = BaseApproachConfig()
-STANCE_DISTANCE = 0.72 - CONFIG.panel_behind  # base to marker plane
+MARKER = Marker()
+STANCE = 0.72  # base to the panel [m]
 
 
 @dc.dataclass
@@ -54,15 +56,17 @@ class Scene:
     marker: np.ndarray
     rng: np.random.Generator
     noise: float = 1.0
+    depth: float = MARKER.panel_depth  # of the panel behind the marker [m]
 
     def stance(self) -> np.ndarray:
         x, y, h = self.marker
-        return np.array([x - STANCE_DISTANCE * np.cos(h), y - STANCE_DISTANCE * np.sin(h), h])
+        back = STANCE - self.depth
+        return np.array([x - back * np.cos(h), y - back * np.sin(h), h])
 
     def clear(self, poses: np.ndarray) -> float:
         """Base centre to the panel's plane, the least of all poses (..., 3)."""
         h = self.marker[2]
-        return float(np.min((self.marker[:2] - poses[..., :2]) @ [np.cos(h), np.sin(h)])) + CONFIG.panel_behind
+        return float(np.min((self.marker[:2] - poses[..., :2]) @ [np.cos(h), np.sin(h)])) + self.depth
 
     def look(self, time: float, pose: np.ndarray) -> tuple[StereoPosition, RectangleEstimate, Stance]:
         far = np.hypot(*(self.marker - pose)[:2]) * self.noise
@@ -70,7 +74,7 @@ class Scene:
         x, y, h = self.marker + shift
         normal = np.array([np.cos(h), np.sin(h), 0.0])
         R = np.column_stack([np.cross([0.0, 0, -1], normal), [0.0, 0, -1], normal])
-        seen = Scene(self.marker + shift, self.rng)
+        seen = Scene(self.marker + shift, self.rng, depth=self.depth)
         return (
             StereoPosition(time=time, found=True, p_LV=np.array([x, y, 1.0]), covariance=np.eye(3) * 1e-4),
             RectangleEstimate(time=time, found=True, X_LV=make(R, np.array([x, y, 1.0]))),
@@ -109,7 +113,9 @@ def drive(
         robot = RobotState(time=t, odometry=odometry, left_arm_velocity=np.full(6, arms(t) if arms else 0.0))
         if watch:
             watch(robot, state, seen)
-        memory, command, status = step(config, memory, t, DT, robot, state, *seen)
+        memory, command, status = step(
+            config, dc.replace(MARKER, panel_depth=scene.depth), memory, t, DT, robot, state, *seen
+        )
         wheels.drive(command.base_twist)
         poses.append(wheels.pose)
         twists.append(command.base_twist)
@@ -240,10 +246,12 @@ def test_fine_approach_ignores_single_wild_stances():
     assert_clear(run, scene, place(scene, 0.3, 1.8))
 
 
-def test_fine_approach_brakes_for_a_stance_at_the_very_edge_of_the_forbidden_zone():
-    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+@pytest.mark.parametrize("depth", [0.05, MARKER.panel_depth, 0.30])
+def test_fine_approach_brakes_for_a_stance_at_the_very_edge_of_the_forbidden_zone(depth):
+    """Whatever the stem's length: the clearance is kept from the panel, not from a place behind the marker."""
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0, depth=depth)
     start = place(scene, 0.0, 2.2)
-    edge = np.array([CONFIG.panel_behind - CONFIG.clearance - 0.002, 0.0, 0.0])
+    edge = np.array([depth - CONFIG.clearance - 0.002, 0.0, 0.0])
     run = drive(
         Mode.FINE_APPROACH,
         Wheels(start),
@@ -251,7 +259,7 @@ def test_fine_approach_brakes_for_a_stance_at_the_very_edge_of_the_forbidden_zon
         alter=lambda t, seen: (*seen[:2], dc.replace(seen[2], base=edge)),
     )
     assert run.status.state == "succeeded"
-    assert scene.clear(run.poses) > CONFIG.clearance
+    assert CONFIG.clearance < scene.clear(run.poses) < CONFIG.clearance + 0.02
 
 
 def test_fine_approach_refuses_a_stance_within_the_clearance():
@@ -388,7 +396,14 @@ def test_outside_its_modes_it_is_idle_and_asks_for_nothing(mode):
     scene = Scene(np.zeros(3), np.random.default_rng(0))
     robot = RobotState(odometry=np.zeros(5))
     _, command, status = step(
-        CONFIG, Memory(), 1.0, DT, robot, ModeState(mode=mode.value, activation=7), *scene.look(1.0, np.zeros(3))
+        CONFIG,
+        MARKER,
+        Memory(),
+        1.0,
+        DT,
+        robot,
+        ModeState(mode=mode.value, activation=7),
+        *scene.look(1.0, np.zeros(3)),
     )
     assert status.state == "idle"
     assert all(getattr(command, f.name) is None for f in dc.fields(Command) if f.name != "time")
@@ -403,7 +418,7 @@ def test_a_new_activation_starts_afresh():
             t = len(result) * DT
             seen = scene.look(t, robot.odometry[:3])
             mode = ModeState(mode="rough_approach", activation=activation)
-            memory, _, status = step(CONFIG, memory, t, DT, robot, mode, *seen)
+            memory, _, status = step(CONFIG, MARKER, memory, t, DT, robot, mode, *seen)
             result.append((status.activation, status.state))
     assert result[199] == (1, "succeeded")
     assert result[200] == (2, "running")
@@ -422,7 +437,7 @@ def test_bad_config_is_refused_by_name(changes, words):
     with pytest.raises(ConfigError, match=words):
         BaseApproachConfig(**changes).check()
     with pytest.raises(ConfigError, match=words):
-        BaseApproachSystem(BaseApproachConfig(**changes))
+        BaseApproachSystem(BaseApproachConfig(**changes), MARKER)
 
 
 # ---------------------------------------------------------------- block
@@ -435,11 +450,11 @@ def rig(**inputs) -> Rig:
         "mode": ModeState(mode="rough_approach", activation=1),
         "position": StereoPosition(time=0.001, found=True, covariance=np.eye(3) * 1e-4),
     }
-    return Rig(BaseApproachSystem(CONFIG), **fixed | inputs)
+    return Rig(BaseApproachSystem(CONFIG, MARKER), **fixed | inputs)
 
 
 def test_ports():
-    assert ports(BaseApproachSystem(CONFIG)) == {
+    assert ports(BaseApproachSystem(CONFIG, MARKER)) == {
         "robot_state": "in abstract",
         "mode": "in abstract",
         "position": "in abstract",
@@ -472,7 +487,7 @@ def test_block_refuses_a_wrong_message_and_needs_the_robot_state():
     with pytest.raises(TypeError, match="want Stance"):
         rig(stance=StereoPosition(), mode=ModeState(mode="fine_approach", activation=1)).run(0.1)
     with pytest.raises(RuntimeError, match="robot_state.*base_approach.*nothing is connected"):
-        Rig(BaseApproachSystem(CONFIG), mode=ModeState(mode="retreat", activation=1)).run(0.1)
+        Rig(BaseApproachSystem(CONFIG, MARKER), mode=ModeState(mode="retreat", activation=1)).run(0.1)
 
 
 # ---------------------------------------------------------------- odometry

@@ -8,6 +8,7 @@ from helpers import Rig, assert_clones_are_independent, assert_holds_between_upd
 from robot_facts import HOME, arm
 
 from valve_drake.checks import ConfigError
+from valve_drake.kinematics import ARM_LIMITS
 from valve_drake.messages import Command, Health, Mode, ModeState, RobotState, SelectorReport, Verdict
 from valve_drake.motion import braking_speed, follow
 from valve_drake.supervisor.command_selector import (
@@ -361,7 +362,7 @@ def test_a_silent_block_means_hold(group):
 
 
 def test_hold_brakes_within_the_acceleration_limit_and_inside_the_range():
-    limit = CONFIG.arm_limit[1]
+    limit = ARM_LIMITS[1]
     for room in (0.15, 0.02):  # enough to brake in, and not
         bench = Bench()
         k = 0

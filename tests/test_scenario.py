@@ -5,7 +5,7 @@ import pytest
 
 from valve_drake import scenario as mut
 from valve_drake.checks import ConfigError
-from valve_drake.stations.simulation_config import Uniform
+from valve_drake.config import Uniform
 
 
 def test_shipped_scenario_loads_and_round_trips():
@@ -53,7 +53,7 @@ def test_close_starts_open_and_an_explicit_position_stays():
         ("simulation.valve.height=!Gaussian {mean: 1}", ["!Gaussian", "!Uniform"]),
         ("simulation.valve.height=!Uniform {min: 1.2, max: 0.9}", ["simulation.valve.height", "min <= max"]),
         ("marker.size=[0.2, 0.1]", ["marker.size", "panel", "0.2"]),
-        ("marker.size=[0.1]", ["marker.size", "two lengths"]),
+        ("marker.size=[0.1]", ["marker.size", "2 values"]),
         ("marker.size=0.1", ["marker.size", "list"]),
         ("marker=3", ["marker", "group of keys"]),
         ("command=push", ["command", "open or close", "push"]),

@@ -17,7 +17,7 @@ from valve_drake.stations.simulation_config import ErrorConfig, StartConfig, Val
 
 PERFECT = [
     f"simulation.error.{name}=0"
-    for name in ("head_yaw", "head_rotation", "head_mount", "odometry_scale", "odometry_noise")
+    for name in ("head_yaw", "head_rotation", "head_mount", "odometry_scale", "odometry_noise", "arm_offset")
 ] + [f"simulation.error.wrench_{kind}=0" for kind in ("noise_force", "noise_torque", "bias_force", "bias_torque")]
 NEAR = [
     "simulation.start.distance=0.9",
@@ -112,6 +112,30 @@ def test_arms_follow_positions_and_report_torque():
     rig.run(0.8)
     np.testing.assert_allclose(rig.read("left_arm.position_measured"), goal, atol=1e-3)
     assert 3 < abs(rig.read("left_arm.torque_measured")[0]) < 40  # carries the arm
+
+
+def true_arm(rig, side):
+    """Joint angles of an arm in the plant, as no controller knows them."""
+    plant = rig.station.GetSubsystemByName("plant")
+    inner = plant.GetMyContextFromRoot(rig.context)
+    return np.array([plant.GetJointByName(name).get_angle(inner) for name in simulated.arm_joints(side)])
+
+
+def test_an_arm_with_a_wrong_zero_goes_to_where_its_encoders_read_the_command():
+    error = ErrorConfig(arm_offset=0.004)
+    offsets = simulated.arm_offsets(error, seed=3)
+    all_of_them = np.concatenate(list(offsets.values()))
+    assert len(set(np.abs(all_of_them))) == 12 and 0.002 < all_of_them.std() < 0.007
+    rig = Rig(["simulation.error.arm_offset=0.004", "seed=3"])
+    home = initial_commands(rig.scenario)
+    for side in SIDES:  # from the first moment: it does not start with a jump
+        np.testing.assert_allclose(true_arm(rig, side), home[f"{side}_arm.position_command"] - offsets[side], atol=1e-9)
+    goal = home["left_arm.position_command"] + np.array([-0.1, 0, 0, 0, 0, 0])
+    rig.set("left_arm.position_command", goal)
+    rig.run(0.8)
+    read = rig.read("left_arm.position_measured")
+    np.testing.assert_allclose(read, goal, atol=1e-3)
+    np.testing.assert_allclose(read - true_arm(rig, "left"), offsets["left"], atol=1e-12)
 
 
 def test_the_base_drives_like_a_differential_drive_and_odometry_agrees_without_errors():

@@ -160,14 +160,14 @@ def test_commands_within_the_joints_speed_pass_to_the_bit():
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        ("{kind: gremlin}", ["faults.kind", "gremlin"]),
-        ("{kind: nan, device: nose}", ["faults.device", "nose"]),
-        ("{kind: nan, mode: dance}", ["faults.mode", "dance"]),
-        ("{kind: loss, share: 2}", ["faults.share", "2"]),
-        ("{kind: latency, delay: 0.01, jitter: 0.02}", ["faults.jitter"]),
-        ("{kind: restart, device: base}", ["faults.duration"]),
-        ("{kind: stuck, device: base}", ["faults.device", "torso"]),
-        ("{kind: stuck, device: torso, joint: 3}", ["faults.joint", "0..2"]),
+        ("{kind: gremlin}", ["faults[0].kind", "gremlin"]),
+        ("{kind: nan, device: nose}", ["faults[0].device", "nose"]),
+        ("{kind: nan, mode: dance}", ["faults[0].mode", "dance"]),
+        ("{kind: loss, share: 2}", ["faults[0].share", "2"]),
+        ("{kind: latency, delay: 0.01, jitter: 0.02}", ["faults[0].jitter"]),
+        ("{kind: restart, device: base}", ["faults[0].duration"]),
+        ("{kind: stuck, device: base}", ["faults[0].device", "torso"]),
+        ("{kind: stuck, device: torso, joint: 3}", ["faults[0].joint", "[0, 2]"]),
     ],
 )
 def test_bad_faults_give_one_line(entry, words):

@@ -2,7 +2,6 @@
 
 import math
 import reprlib
-from collections.abc import Iterable
 from pathlib import PurePath
 from typing import Any
 
@@ -49,14 +48,6 @@ def require(ok: bool, key: str, rule: str, value: object) -> None:
     """Raises ConfigError "<key> must be <rule>, got <value>" unless `ok`."""
     if not ok:
         raise ConfigError(f"{key} must be {rule}, got {shown(value)}")
-
-
-def require_positive(config: object, block: str, names: Iterable[str]) -> None:
-    """Every named field of `config` is a finite number above zero."""
-    for name in names:
-        value = getattr(config, name)
-        good = isinstance(value, int | float) and math.isfinite(value) and value > 0
-        require(good, f"{block}.{name}", "a finite number > 0", value)
 
 
 def require_in(value: float, low: float, high: float, key: str) -> None:

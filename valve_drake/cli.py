@@ -12,13 +12,26 @@ from valve_drake.commands import (
     replay,
     review,
     run,
+    scenario,
     teach,
     twin,
 )
 from valve_drake.commands.common import BAD_INPUT, FAILED, Parser
 from valve_drake.console import complain
 
-COMMANDS = (run, twin, draw, teach, review, experiment, replay, recover, estimate, calibrate)  # as --help lists them
+COMMANDS = (
+    run,
+    twin,
+    scenario,
+    draw,
+    teach,
+    review,
+    experiment,
+    replay,
+    recover,
+    estimate,
+    calibrate,
+)  # as --help lists them
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

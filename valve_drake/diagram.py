@@ -160,7 +160,7 @@ def make_blocks(scenario: Scenario) -> list:
         RectangleEstimatorSystem(scenario.rectangle_estimator, head, GEOMETRY.head_pose, marker),
         HandleMarkerSystem(scenario.handle_marker),
         ValveSearchSystem(scenario.valve_search, lambda base, torso: compose(GEOMETRY.head_pose(base, torso), X_LEyes)),
-        BaseApproachSystem(scenario.base_approach),
+        BaseApproachSystem(scenario.base_approach, marker),
         KinematicApproachSystem(
             KinematicApproach(
                 scenario.kinematic_approach, scenario.stance, marker, GEOMETRY, view, area, collision.is_free

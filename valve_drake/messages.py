@@ -14,6 +14,8 @@ import numpy as np
 REMEMBERED = 1.0  # where the head and the hands were is known for so long: no older image can be placed [s]
 LEFT, RIGHT = "left", "right"
 SIDES = (LEFT, RIGHT)
+CAMERAS = ("head_left", "head_right", "left_wrist", "right_wrist")
+DEVICES = ("base", "torso", *(f"{s}_{d}" for s in SIDES for d in ("arm", "gripper", "wrist_sensor")), *CAMERAS, "robot")
 
 
 def array(*shape: int, fill: float = 0.0, optional: bool = False) -> Any:

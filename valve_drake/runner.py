@@ -13,7 +13,7 @@ import platform
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -21,11 +21,13 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
-from valve_drake import resources
+from valve_drake import config, resources, yaml_file
 from valve_drake.analysis.comparison import Comparison
 from valve_drake.analysis.metrics import Summary, summarize
+from valve_drake.behaviors.taught import load_taught
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError, require
+from valve_drake.config import key_names
 from valve_drake.diagram import System, command, make_diagram
 from valve_drake.messages import Mode, ModeState, OperatorCommand
 from valve_drake.pace import PACE, Pace, Pacer
@@ -37,7 +39,7 @@ from valve_drake.recording.recorder_system import RecorderSystem, Sink, Tee
 from valve_drake.recording.robot_frames import RobotFrames, pinholes
 from valve_drake.recording.signals import signals
 from valve_drake.recording.writer import LogError, LogWriter
-from valve_drake.scenario import Scenario, dump, parse, resolve, with_overrides
+from valve_drake.scenario import RETIRED, TAGS, Scenario, dump, parse, resolve, split_override, with_overrides
 from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.hardware import AHEAD, RobotLink
@@ -151,6 +153,7 @@ def run(
     scenario = resolve(scenario)
     scenario.check()
     require(scenario.station != "replay", "station", "one that runs (a log is replayed by `replay LOG`)", "replay")
+    files = _read_files(scenario)  # before anything is opened: a scenario that cannot be run leaves no trace
     cv2.setNumThreads(1)  # the same bits on any machine, and the renderer wants the cores
     meshcat = None
     if scenario.station == "hardware":
@@ -162,7 +165,7 @@ def run(
     profile.clear()
     writer = LogWriter(log)
     with _log_kept(writer), CameraWorkers() as workers:
-        _begin_log(writer, scenario, scenario)
+        _begin_log(writer, scenario, files)
         sink = writer if live is None else Tee(writer, live)
         recorder = make_recorder(sink, scenario)
         system = make_diagram(scenario, recorder, meshcat=meshcat, workers=workers, link=link, truth=truth)
@@ -187,13 +190,23 @@ def run(
     return Result(summarize(written), wall, written, html, writer.error, shares, profile.render_worker_seconds, pace)
 
 
-def _begin_log(writer: LogWriter, scenario: Scenario, files: Scenario, **facts: str) -> None:
-    """What every log begins with; `files` names the files to attach."""
+def _read_files(scenario: Scenario) -> dict[str, bytes]:
+    """The files that a scenario names, by the name under which a log holds them. Raises ConfigError unless each is
+    what it should be: nothing else of a user's files gets into a log."""
+    files = {}
+    for key, load in (("head_calibration", load_head), ("taught", load_taught)):
+        path = resources.find(getattr(scenario, key), resources.models())
+        load(path)
+        files[FILES[key]] = path.read_bytes()
+    return files
+
+
+def _begin_log(writer: LogWriter, scenario: Scenario, files: Mapping[str, bytes], **facts: str) -> None:
+    """What every log begins with; `files`: to attach, by name."""
     about = {"scenario": dump(scenario), "seed": str(scenario.seed), "station": scenario.station}
     writer.write_metadata("run", about | versions() | facts)
     writer.attach(layout.NAME, layout.MEDIA_TYPE, json.dumps(layout.layout(), indent=1).encode())
-    for key, name in FILES.items():
-        data = resources.find(getattr(files, key), resources.models()).read_bytes()
+    for name, data in files.items():
         writer.attach(name, "application/yaml", data)
 
 
@@ -333,8 +346,8 @@ def replay(
     overrides: other values of the log's scenario, as `key=value`. copy: writes the replay's own log there.
     Raises ConfigError if this version of the program cannot replay the log, LogError if `copy` cannot be written.
     """
-    recorded = _recorded_scenario(log)
-    changed = [override.partition("=")[0].strip() for override in overrides]
+    recorded, notes = _recorded_scenario(log)
+    changed = [split_override(override)[0] for override in overrides]
     for key in changed:
         if key.partition(".")[0] in RECORDED:
             raise ConfigError(f"--set {key}: it is recorded; a replay can change the blocks' keys only")
@@ -344,12 +357,13 @@ def replay(
     comparison = Comparison(log, recording.end)
     with contextlib.ExitStack() as stack:
         files = stack.enter_context(_files_of(log, scenario, changed))
+        data = _read_files(files)
         sink: Sink = comparison
         writer = None
         if copy is not None:
             require(copy.resolve() != log.path.resolve(), "--log", "another file than the log itself", str(copy))
             writer = stack.enter_context(LogWriter(copy))
-            _begin_log(writer, scenario, files, replay_of=log.path.name)
+            _begin_log(writer, scenario, data, replay_of=log.path.name)
             sink = Tee(comparison, writer)
         system = make_diagram(files, make_recorder(sink, files), recording=recording)
         begin = time.perf_counter()
@@ -358,14 +372,26 @@ def replay(
         wall = time.perf_counter() - begin
         if writer is not None:
             writer.write_metadata("result", _result_metadata(mode, recording.end))
-    return Replay(comparison, recording.end, wall, log.damage, _notes(log, recorded, recording, changed))
+    return Replay(comparison, recording.end, wall, log.damage, notes + _notes(log, recorded, recording, changed))
 
 
-def _recorded_scenario(log: LogReader) -> Scenario:
+def _recorded_scenario(log: LogReader) -> tuple[Scenario, list[str]]:
+    """The scenario of a log, and in which keys it and this program differ."""
     text = log.metadata.get("run", {}).get("scenario")
     if text is None:
         raise ConfigError(f"{log.path} cannot be replayed: it does not hold its scenario")
-    return parse(text, str(log.path))
+    unknown: list[str] = []
+    scenario = parse(text, str(log.path), unknown=unknown)
+    for key in unknown:
+        if key not in RETIRED:
+            raise ConfigError(f"{log.path} cannot be replayed: its scenario has the unknown key {key}")
+    missing = sorted(key_names(config.tree(scenario)) - key_names(yaml_file.parse(text, str(log.path), TAGS)))
+    notes = []
+    if missing:
+        notes.append(f"the log's scenario lacks keys of this program, their defaults stand in: {', '.join(missing)}")
+    if unknown:
+        notes.append(f"the log's scenario has keys that this program no longer has: {', '.join(unknown)}")
+    return scenario, notes
 
 
 @contextlib.contextmanager
@@ -407,8 +433,6 @@ def _notes(log: LogReader, recorded: Scenario, recording: Recording, changed: Co
     """What is not as it was when the log was written, and what of it is not replayed."""
     facts, now = log.metadata["run"], versions()
     notes = [f"{name} was {facts[name]}, is {now[name]}" for name in now if facts.get(name, now[name]) != now[name]]
-    if dump(recorded) != facts["scenario"]:
-        notes.append("the log's scenario lacks keys of this program: their defaults stand in")
     for key in (key for key, name in FILES.items() if key not in changed and name not in log.attachments):
         notes.append(f"the log does not hold its {key}: {getattr(recorded, key)} of today stands in")
     if recording.end < log.end:

@@ -1,29 +1,26 @@
-"""The scenario: one typed field for every block, and the world around it. Load, check, override, sample, save.
+"""The scenario: one group of keys for every block, and the world around it. Load, check, override, sample.
 
 A scenario file is YAML with this file's names; what it leaves out has its default. Numbers of the simulated world
 may be distributions (`!Uniform {min: 0.81, max: 1.22}`): `resolve` draws them from the seed, each from a stream of its
-own name, so that a new key changes no other number.
+own name, so that a new key changes no other number. `valve-drake scenario` prints every key with its bounds.
 """
 
 import dataclasses as dc
-import math
 import typing
 import zlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
-from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
-from valve_drake import resources
+from valve_drake import config, resources, yaml_file
 from valve_drake.behaviors.base_approach import BaseApproachConfig
 from valve_drake.behaviors.grasp_geometry import StanceConfig
 from valve_drake.behaviors.hybrid_rotation import HybridRotationConfig
 from valve_drake.behaviors.image_servo import ImageServoConfig
 from valve_drake.behaviors.kinematic_approach import KinematicApproachConfig
 from valve_drake.behaviors.valve_search import ValveSearchConfig
-from valve_drake.checks import ConfigError, require, require_in
+from valve_drake.checks import ConfigError, require, shown
+from valve_drake.config import Config, Uniform, choice, number, plain
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig
 from valve_drake.perception.handle_marker import HandleMarkerConfig
 from valve_drake.perception.line_fitting import LineFittingConfig
@@ -32,26 +29,36 @@ from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig
 from valve_drake.stations.faults import FaultConfig
 from valve_drake.stations.lcm_channels import HardwareConfig
-from valve_drake.stations.simulation_config import SimulationConfig, Uniform
+from valve_drake.stations.simulation_config import SimulationConfig
 from valve_drake.supervisor.command_selector import CommandSelectorConfig
 from valve_drake.supervisor.supervisor import SupervisorConfig
 
 PLATE = 0.15  # the valve's face that carries the marker, square [m]
 DEFAULT = "simulated.scenario.yaml"
+# Keys of older versions: a log that has them can still be replayed.
+RETIRED = (
+    "base_approach.panel_behind",
+    "command_selector.arm_limit",
+    "handle_marker.lines.single_camera",
+    *(
+        f"handle_marker.segmentation.{name}"
+        for name in ("min_opponent", "min_green_area", "min_fill", "border", "follow", "full_every", "every")
+    ),
+)
 STATIONS = ("simulated", "hardware", "replay")
 
 
 @dc.dataclass
-class Scenario:
+class Scenario(Config):
     """Everything that a run depends on."""
 
-    seed: int = 0
-    station: str = "simulated"
-    command: str = "open"  # open | close
-    angle: float = 1.5707963267948966  # to turn [rad]
-    time_limit: float = 240.0  # of the whole run [s]
-    head_calibration: str = "calibration/head.yaml"  # a path, or one below models/
-    taught: str = "taught/hands.yaml"  # the same
+    seed: int = number(0, 0, 2**31 - 1, "of all that chance decides")
+    station: str = choice("simulated", STATIONS, "which robot")
+    command: str = choice("open", ("open", "close"), "what to do with the valve")
+    angle: float = number(1.5707963267948966, 0.01, 6.29, "to turn [rad]")
+    time_limit: float = number(240.0, 0.1, 3600.0, "of the whole run [s]")
+    head_calibration: str = plain("calibration/head.yaml", "a path, or one below models/")
+    taught: str = plain("taught/hands.yaml", "a path, or one below models/")
     marker: Marker = dc.field(default_factory=Marker)
     color_segmentation: ColorSegmentationConfig = dc.field(default_factory=ColorSegmentationConfig)
     line_fitting: LineFittingConfig = dc.field(default_factory=LineFittingConfig)
@@ -68,22 +75,42 @@ class Scenario:
     command_selector: CommandSelectorConfig = dc.field(default_factory=CommandSelectorConfig)
     simulation: SimulationConfig = dc.field(default_factory=SimulationConfig)
     hardware: HardwareConfig = dc.field(default_factory=HardwareConfig)
-    faults: list[FaultConfig] = dc.field(default_factory=list)  # of the twin
+    faults: list[FaultConfig] = dc.field(default_factory=list, metadata=config.about("of the twin, on purpose"))
 
-    def check(self) -> None:
-        """Raises ConfigError that names the key, the rule and the value."""
-        require(0 <= self.seed < 2**31, "seed", "within [0, 2^31)", self.seed)
-        require(self.station in STATIONS, "station", " or ".join(STATIONS), self.station)
-        require(self.command in ("open", "close"), "command", "open or close", self.command)
-        require_in(self.angle, 0.01, 6.29, "angle")
-        require_in(self.time_limit, 0.1, 3600.0, "time_limit")
-        for length in self.marker.size:
+    def check(self, key: str | None = None) -> None:
+        for length in self.marker.size:  # first: what else is wrong with a marker that large is no help
             require(length <= PLATE, "marker.size", f"not larger than the panel's face of {PLATE} m", self.marker.size)
-        for field in dc.fields(self):
-            value = getattr(self, field.name)
-            for part in value if isinstance(value, list) else [value]:
-                if dc.is_dataclass(part):
-                    part.check()
+        super().check(key)
+
+    def relations(self, key: str) -> None:
+        """What the blocks have to agree on."""
+        limit = self.supervisor.angle_limit
+        require(self.angle <= limit, "angle", f"at most supervisor.angle_limit, {limit:g}", self.angle)
+        # The collision model and the start of a run know one opening of the hands, and the selector clips all.
+        selector, opening = self.command_selector, self.kinematic_approach.opening
+        high = selector.gripper_high
+        require(
+            opening <= high, "kinematic_approach.opening", f"at most command_selector.gripper_high, {high:g}", opening
+        )
+        for name in ("image_servo", "hybrid_rotation"):
+            value = getattr(self, name).opening
+            require(value == opening, f"{name}.opening", f"that of kinematic_approach, {opening:g}", value)
+        for name in ("kinematic_approach.gripper_force", "image_servo.gripper_force", "hybrid_rotation.grip_force",
+                     "hybrid_rotation.open_force"):  # fmt: skip
+            block, _, force = name.partition(".")
+            most, value = selector.gripper_force, getattr(getattr(self, block), force)
+            require(value <= most, name, f"at most command_selector.gripper_force, {most:g}", value)
+        # The gaze is planned within what the selector lets through.
+        search = self.valve_search
+        waist, pitch, yaw = zip(selector.torso_low, selector.torso_high)
+        for name, value, (low, high) in (
+            ("sweep_waist", search.sweep_waist, (0.0, min(-waist[0], waist[1]))),
+            ("pitch_low", search.pitch_low, pitch),
+            ("pitch_high", search.pitch_high, pitch),
+            ("yaw_limit", search.yaw_limit, (0.0, min(-yaw[0], yaw[1]))),
+        ):
+            words = f"within command_selector's torso limits, [{low:g}, {high:g}]"
+            require(low <= value <= high, f"valve_search.{name}", words, value)
 
 
 def load(path: str | None = None, overrides: typing.Sequence[str] = ()) -> Scenario:
@@ -92,30 +119,47 @@ def load(path: str | None = None, overrides: typing.Sequence[str] = ()) -> Scena
     Raises ConfigError: no such file, not YAML, unknown key, wrong type, value out of range.
     """
     file = resources.find(path or DEFAULT, resources.diagrams())
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file.name}: cannot be read ({type(error).__name__})") from error
-    return with_overrides(parse(text, file.name), overrides)
+    return with_overrides(parse(yaml_file.read_text(file, file.name), file.name), overrides)
 
 
 def with_overrides(scenario: Scenario, overrides: typing.Sequence[str]) -> Scenario:
     """The scenario with `key=value` overrides, checked. Raises ConfigError as `load` does."""
     for override in overrides:
-        key, equals, value = override.partition("=")
-        if not equals or not key:
-            raise ConfigError(f"--set {override}: want key=value, e.g. simulation.valve.friction=7.3")
-        lines = key.strip().split(".")
-        text = "".join("  " * k + f"{name}:\n" for k, name in enumerate(lines[:-1]))
-        text += "  " * (len(lines) - 1) + f"{lines[-1]}: {value}\n"
-        scenario = parse(text, f"--set {key}", scenario)
+        key, value = split_override(override)
+        source = f"--set {key}"
+        given = yaml_file.parse(value, source, TAGS)
+        for name in reversed(key.split(".")):
+            given = {name: given}
+        scenario = config.build(scenario, given, source)
     scenario.check()
     return scenario
 
 
+def split_override(override: str) -> tuple[str, str]:
+    """`key=value` -> key, value. Raises ConfigError."""
+    key, equals, value = override.partition("=")
+    key = key.strip()
+    if not equals or not key:
+        raise ConfigError(f"--set must be key=value, e.g. simulation.valve.friction=7.3, got {shown(override)}")
+    return key, value
+
+
+TAGS: yaml_file.Tags = {config.UNIFORM: lambda given: yaml_file.Tagged(config.UNIFORM, given)}
+
+
+def parse(text: str, source: str, defaults: Scenario | None = None, unknown: list[str] | None = None) -> Scenario:
+    """A scenario from YAML text on top of `defaults`; `source` is named in errors.
+
+    unknown: gets the names of keys that this program does not have; None: they are refused. Bounds are not checked.
+    """
+    scenario = Scenario() if defaults is None else defaults
+    given = yaml_file.parse(text, source, TAGS)
+    return config.build(scenario, {} if given is None else given, source, unknown)
+
+
 def dump(scenario: Scenario) -> str:
     """All values, defaults included, as YAML that `load` reads."""
-    return yaml_dump_typed(scenario, schema=Scenario)
+    return yaml_file.dump(config.tree(scenario))
 
 
 def resolve(scenario: Scenario) -> Scenario:
@@ -136,86 +180,3 @@ def resolve(scenario: Scenario) -> Scenario:
     if valve.position < 0:
         valve.position = valve.travel if scenario.command == "close" else 0.0
     return out
-
-
-def parse(text: str, source: str, defaults: Scenario | None = None) -> Scenario:
-    """A scenario from YAML text on top of `defaults`; `source` is named in errors."""
-    scenario = Scenario() if defaults is None else defaults
-    try:
-        tree = yaml.load(text, Loader=_Loader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        raise ConfigError(f"{source}: not YAML" + (f" (line {mark.line + 1})" if mark else "")) from error
-    if tree is None:
-        return scenario
-    _check_types(tree, Scenario, "", source)
-    try:
-        return yaml_load_typed(schema=Scenario, data=text, defaults=scenario, retain_map_defaults=True)
-    except Exception as error:  # whatever the type check above let pass
-        raise ConfigError(f"{source}: {str(error).splitlines()[0]}") from error
-
-
-class _Tagged(dict):
-    """A YAML mapping with a tag such as !Uniform."""
-
-
-class _Loader(yaml.SafeLoader):
-    pass
-
-
-def _tagged(loader: yaml.SafeLoader, suffix: str, node: yaml.Node) -> _Tagged:
-    if suffix != "Uniform" or not isinstance(node, yaml.MappingNode):
-        raise ConfigError(f"unknown tag !{suffix}; distributions are written !Uniform {{min: a, max: b}}")
-    return _Tagged(loader.construct_mapping(node))
-
-
-_Loader.add_multi_constructor("!", _tagged)
-
-
-def _check_types(value: Any, kind: Any, key: str, source: str) -> None:
-    """Says which key is unknown or of a wrong type (Drake's reader names neither)."""
-    at = f"{source}: {key}" if key else source
-    if dc.is_dataclass(kind):
-        if not isinstance(value, dict) or isinstance(value, _Tagged) and kind is not Uniform:
-            raise ConfigError(f"{at} must be a group of keys, got {value!r}")
-        fields = {f.name: f.type for f in dc.fields(kind)}
-        for name, item in value.items():
-            inner = f"{key}.{name}" if key else str(name)
-            if name not in fields:
-                near = ", ".join(sorted(fields))
-                raise ConfigError(f"{source}: unknown key {inner}; known here: {near}")
-            _check_types(item, fields[name], inner, source)
-        return
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is typing.Union:
-        if isinstance(value, _Tagged):
-            return _check_types(value, Uniform, key, source)
-        kind = float
-    if origin is list:
-        if not isinstance(value, list):
-            raise ConfigError(f"{at} must be a list, got {value!r}")
-        for k, item in enumerate(value):
-            _check_types(item, arguments[0], f"{key}[{k}]", source)
-        return None
-    if origin is dict:
-        if not isinstance(value, dict):
-            raise ConfigError(f"{at} must be a group of keys, got {value!r}")
-        for name, item in value.items():
-            _check_types(item, arguments[1], f"{key}.{name}", source)
-        return None
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    good = {
-        float: number and math.isfinite(value) if number else False,
-        int: isinstance(value, int) and not isinstance(value, bool),
-        bool: isinstance(value, bool),
-        str: isinstance(value, str),
-    }[kind]
-    if not good:
-        words = {float: "a finite number", int: "a whole number", bool: "true or false", str: "text"}
-        raise ConfigError(f"{at} must be {words[kind]}, got {value!r}")
-    return None
-
-
-def save(scenario: Scenario, path: Path) -> None:
-    """Writes `dump` to a file."""
-    path.write_text(dump(scenario), encoding="utf-8")

@@ -6,6 +6,7 @@ stands twice, a tag that nobody asked for, a number that does not fit.
 """
 
 import copy
+import dataclasses as dc
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -22,6 +23,15 @@ MAX_DEPTH = 32  # of nested lists and mappings
 
 Tree: TypeAlias = Any  # dict with text as keys, list, str, int, float, bool, None, or what a handler of a tag returns
 Tags: TypeAlias = Mapping[str, Callable[[Tree], Any]]  # tag as written (!Uniform, !!opencv-matrix) -> its handler
+
+
+@dc.dataclass(frozen=True)
+class Tagged:
+    """A value that carries a tag of its own: what `dump` writes with it, and a handler may return."""
+
+    tag: str
+    tree: Tree
+
 
 _NULL = {"", "~", "null", "Null", "NULL"}
 _BOOL = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
@@ -84,10 +94,10 @@ def documents(text: str, source: str, tags: Tags | None = None) -> list[Tree]:
     return [tree for tree in trees if tree is not None]
 
 
-def dump(tree: Tree, comment: str = "") -> str:
-    """A tree as text that `parse` reads back bit for bit, below lines of comment."""
+def dump(tree: Tree, comment: str = "", width: int = 110) -> str:
+    """A tree as text that `parse` reads back bit for bit, below lines of comment. width: of its lines [characters]."""
     lines = "".join(f"# {line}\n" for line in comment.splitlines())
-    return lines + yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=110)
+    return lines + yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=width)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -97,6 +107,20 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
+def _represent_tagged(dumper: yaml.SafeDumper, data: Tagged) -> yaml.Node:
+    node = dumper.represent_data(data.tree)
+    node.tag, node.flow_style = data.tag, True
+    return node
+
+
+def _represent_list(dumper: yaml.SafeDumper, data: list[Tree]) -> yaml.Node:
+    """Lists of numbers or texts in a line."""
+    nested = any(isinstance(item, list | dict) for item in data)
+    return dumper.represent_sequence(_STANDARD + "seq", data, flow_style=not nested)
+
+
+_Dumper.add_representer(Tagged, _represent_tagged)
+_Dumper.add_representer(list, _represent_list)
 _Dumper.add_implicit_resolver(_STANDARD + "float", re.compile(rf"^(?:{_FLOAT.pattern}|{_INT.pattern})$"), None)
 
 

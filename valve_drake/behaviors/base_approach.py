@@ -24,7 +24,8 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.checks import require, require_positive
+from valve_drake.checks import require
+from valve_drake.config import Config, number
 from valve_drake.frames import apply, compose, wrap
 from valve_drake.messages import (
     Command,
@@ -38,54 +39,56 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.motion import slew, towards
+from valve_drake.perception.marker import Marker
 
 MODES = (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT)
 
 
 @dc.dataclass
-class BaseApproachConfig:
+class BaseApproachConfig(Config):
     """Scenario key `base_approach`."""
 
-    speed: float = 0.7  # in the rough approach [m/s]
-    fine_speed: float = 0.5  # to the pre-stance [m/s]
-    line_speed: float = 0.3  # straight in [m/s]
-    reverse_speed: float = 0.3  # [m/s]
-    trim_speed: float = 0.05  # at the stance, at most [m/s]
-    yaw_rate: float = 1.0  # [rad/s]
-    acceleration: float = 0.7  # of the command [m/s^2]
-    yaw_acceleration: float = 1.5  # [rad/s^2]
-    braking: float = 0.6  # share of the accelerations that braking counts on; the rest makes up for the base's lag
-    steering: float = 3.0  # yaw rate per heading error, at most [1/s]
-    closing: float = 2.5  # speed per distance to go, at most: the base lags behind its command [1/s]
-    rough_distance: float = 2.0  # the rough approach ends nearer than this [m]
-    rough_stop: float = 1.85  # and comes to rest here; it never drives nearer [m]
-    facing: float = 0.4  # turns on the spot beyond this bearing, before it drives [rad]
-    sightings: int = 5  # the median of so many is what it steers by
-    pre_stance: float = 0.6  # behind the stance [m]
-    look: float = 0.22  # look-ahead of the line law [m]
-    panel_behind: float = 0.131  # marker plane to panel [m]
-    clearance: float = 0.62  # base centre to panel plane [m]
-    position_tolerance: float = 0.015  # [m]
-    heading_tolerance: float = 0.0175  # [rad]
-    still_time: float = 0.3  # [s]
-    still_speed: float = 0.01  # measured, slower is still [m/s]
-    still_rate: float = 0.02  # [rad/s]
-    attempts: int = 4  # at coming in straight
-    stance_patience: float = 5.0  # wait for a first stance [s]
-    odometry_check: float = 0.6  # driven so far, odometry is held against the cameras [m]
-    odometry_error: float = 0.35  # of what was driven: more is a fault; raise it for wheels that slip
-    retreat_distance: float = 0.5  # [m]
-    retreat_speed: float = 0.2  # [m/s]
-    arms_still: float = 0.05  # joint speed below which the arms are still [rad/s]
-    arms_wait: float = 0.5  # they have to be still for so long before it retreats [s]
-    arms_patience: float = 6.0  # and it retreats anyway after this [s]
+    KEY = "base_approach"
+    speed: float = number(0.7, 0.05, 1.5, "in the rough approach [m/s]")
+    fine_speed: float = number(0.5, 0.02, 1.5, "to the pre-stance [m/s]")
+    line_speed: float = number(0.3, 0.02, 1.0, "straight in along the line to the stance [m/s]")
+    reverse_speed: float = number(0.3, 0.02, 1.0, "backwards [m/s]")
+    trim_speed: float = number(0.05, 0.005, 0.3, "at the stance, at most [m/s]")
+    yaw_rate: float = number(1.0, 0.05, 2.0, "[rad/s]")
+    acceleration: float = number(0.7, 0.05, 1.5, "of the command [m/s^2]")
+    yaw_acceleration: float = number(1.5, 0.1, 4.0, "[rad/s^2]")
+    braking: float = number(
+        0.6, 0.1, 1.0, "share of the accelerations that braking counts on; lower it if the base overshoots"
+    )
+    steering: float = number(3.0, 0.2, 10.0, "yaw rate per heading error, at most [1/s]")
+    closing: float = number(2.5, 0.2, 10.0, "speed per distance to go, at most; lower it if the base overshoots [1/s]")
+    rough_distance: float = number(2.0, 1.2, 6.0, "the rough approach ends nearer to the marker than this [m]")
+    rough_stop: float = number(1.85, 1.2, 6.0, "and comes to rest here; it never drives nearer [m]")
+    facing: float = number(0.4, 0.05, 1.5, "turns on the spot beyond this bearing, before it drives [rad]")
+    sightings: int = number(5, 1, 50, "it steers by the median of so many")
+    odometry_check: float = number(0.6, 0.1, 3.0, "driven so far, odometry is held against the cameras [m]")
+    odometry_error: float = number(
+        0.35, 0.05, 0.5, "share of what was driven: more is a fault; raise it for wheels that slip"
+    )
+    pre_stance: float = number(0.6, 0.1, 2.0, "behind the stance [m]")
+    look: float = number(0.22, 0.05, 2.0, "look-ahead of the line law; raise it if the base swings [m]")
+    clearance: float = number(0.62, 0.55, 1.5, "base centre to panel plane, at least [m]")
+    position_tolerance: float = number(0.015, 0.002, 0.1, "at the stance [m]")
+    heading_tolerance: float = number(0.0175, 0.002, 0.2, "at the stance [rad]")
+    still_time: float = number(0.3, 0.05, 5.0, "the base stands still for so long before it has arrived [s]")
+    still_speed: float = number(0.01, 0.001, 0.05, "measured, slower is still [m/s]")
+    still_rate: float = number(0.02, 0.002, 0.1, "measured, slower is still [rad/s]")
+    attempts: int = number(4, 1, 20, "at coming in straight")
+    stance_patience: float = number(5.0, 0.5, 60.0, "it waits so long for a first stance [s]")
+    retreat_distance: float = number(0.5, 0.05, 2.0, "straight back [m]")
+    retreat_speed: float = number(0.2, 0.02, 0.5, "[m/s]")
+    arms_still: float = number(0.05, 0.005, 0.5, "joint speed below which the arms are still [rad/s]")
+    arms_wait: float = number(0.5, 0.05, 10.0, "they are still for so long before the base retreats [s]")
+    arms_patience: float = number(6.0, 0.5, 60.0, "and it retreats anyway after this [s]")
 
-    def check(self) -> None:
-        block = "base_approach"
-        require_positive(self, block, vars(self))
-        require(self.braking <= 1, f"{block}.braking", "at most 1", self.braking)
-        within = 1.2 < self.rough_stop < self.rough_distance  # nearer, the valve's bar could be in the way of turning
-        require(within, f"{block}.rough_stop", "above 1.2 m and below rough_distance", self.rough_stop)
+    def relations(self, key: str) -> None:
+        below = self.rough_stop < self.rough_distance
+        require(below, f"{key}.rough_stop", f"below rough_distance, {self.rough_distance:g}", self.rough_stop)
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -127,6 +130,7 @@ class Memory:
 
 def step(
     config: BaseApproachConfig,
+    marker: Marker,
     memory: Memory,
     time: float,
     dt: float,
@@ -151,7 +155,7 @@ def step(
         if mode.mode == Mode.ROUGH_APPROACH:
             m, goal = _rough(config, m, dt, robot_state, position)
         elif mode.mode == Mode.FINE_APPROACH:
-            m, goal = _fine(config, m, time, dt, robot_state, estimate, stance)
+            m, goal = _fine(config, marker, m, time, dt, robot_state, estimate, stance)
         else:
             m, goal = _retreat(config, m, time, dt, robot_state)
     m = dc.replace(m, twist=slew(m.twist, goal, np.array([config.acceleration, config.yaw_acceleration]) * dt))
@@ -255,6 +259,7 @@ def _offset(base: np.ndarray, goal: np.ndarray) -> _Offset:
 
 def _fine(
     config: BaseApproachConfig,
+    marker: Marker,
     m: Memory,
     time: float,
     dt: float,
@@ -263,7 +268,7 @@ def _fine(
     stance: Stance,
 ) -> tuple[Memory, np.ndarray]:
     if estimate.found and estimate.time > m.panel.seen:
-        m = dc.replace(m, panel=m.panel.add(estimate.time, _panel(config, estimate), config.sightings))
+        m = dc.replace(m, panel=m.panel.add(estimate.time, _panel(marker, estimate), config.sightings))
     if stance.found and stance.time > m.stance.seen:
         m = dc.replace(m, stance=m.stance.add(stance.time, stance.base, config.sightings))
     if not (_sure(config, m.panel) and _sure(config, m.stance)):
@@ -279,7 +284,7 @@ def _fine(
     if m.phase != "settle":
         m = dc.replace(m, quiet_since=time)  # stillness counts from there on
     if m.phase == "plan":
-        m = _plan(config, m, base, goal, at, panel)
+        m = _plan(config, m, base, goal, at, _ahead(panel, -marker.panel_depth))
         if m.result == "failed":
             return m, np.zeros(2)
     if m.phase == "settle":
@@ -296,11 +301,11 @@ def _ahead(pose: np.ndarray, distance: float) -> np.ndarray:
     return pose[:2] + distance * np.array([np.cos(pose[2]), np.sin(pose[2])])
 
 
-def _panel(config: BaseApproachConfig, estimate: RectangleEstimate) -> np.ndarray:
+def _panel(marker: Marker, estimate: RectangleEstimate) -> np.ndarray:
     """A point of the panel's plane and the heading of its normal into it, on the floor -> (3,)."""
     X_OV = compose(estimate.X_OL, estimate.X_LV)
-    marker = np.array([*X_OV[:2, 3], np.arctan2(X_OV[1, 2], X_OV[0, 2])])
-    return np.array([*_ahead(marker, config.panel_behind), marker[2]])
+    pose = np.array([*X_OV[:2, 3], np.arctan2(X_OV[1, 2], X_OV[0, 2])])
+    return np.array([*_ahead(pose, marker.panel_depth), pose[2]])
 
 
 def _pre_stance(config: BaseApproachConfig, goal: np.ndarray) -> np.ndarray:
@@ -312,9 +317,9 @@ def _within(config: BaseApproachConfig, at: _Offset) -> bool:
 
 
 def _plan(
-    config: BaseApproachConfig, m: Memory, base: np.ndarray, goal: np.ndarray, at: _Offset, panel: np.ndarray
+    config: BaseApproachConfig, m: Memory, base: np.ndarray, goal: np.ndarray, at: _Offset, marker: np.ndarray
 ) -> Memory:
-    """Chooses the first phase of a new attempt."""
+    """Chooses the first phase of a new attempt. marker: its centre on the floor (2,)."""
     if _within(config, at):
         return dc.replace(m, phase="settle")
     if m.attempt >= config.attempts:
@@ -327,7 +332,6 @@ def _plan(
     if np.linalg.norm(way) < 0.05:
         return dc.replace(m, phase="align")
     # The widest angle between the robot's front and the marker on the way, for driving forwards and backwards.
-    marker = _ahead(panel, -config.panel_behind)
     lines = [marker - base[:2], marker - base[:2] - way]
     course = np.arctan2(way[1], way[0])
     angles = [abs(wrap(float(np.arctan2(line[1], line[0]) - course))) for line in lines]

@@ -2,6 +2,7 @@
 
 from valve_drake.behaviors.base_approach import BaseApproachConfig, Memory, step
 from valve_drake.messages import Command, ModeState, RectangleEstimate, RobotState, Stance, Status, StereoPosition
+from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK, Block, Inputs, Outputs
 
 
@@ -29,9 +30,11 @@ class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
 
     OUTPUTS = {"command": Command, "status": Status}
 
-    def __init__(self, config: BaseApproachConfig, name: str = "base_approach"):
+    def __init__(self, config: BaseApproachConfig, marker: Marker, name: str = "base_approach"):
         config.check()
+        marker.check()
         self.config = config
+        self.marker = marker
         super().__init__(name, period=2 * TICK)
 
     def initial(self) -> Memory:
@@ -40,6 +43,7 @@ class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
     def step(self, time: float, inputs: BaseApproachInputs, memory: Memory) -> tuple[Memory, Outputs]:
         memory, command, status = step(
             self.config,
+            self.marker,
             memory,
             time,
             self.period,

@@ -8,28 +8,39 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.checks import require_in, require_positive
+from valve_drake.checks import require
+from valve_drake.config import Config, number
 from valve_drake.frames import compose, inverse, make, planar, rot_z
 from valve_drake.kinematics import RobotGeometry, lateral
 from valve_drake.messages import SIDES
 from valve_drake.perception.marker import Marker
 
+MAX_PLACES = 40  # distances of one search for a stance: it must end while the robot waits
+
 
 @dc.dataclass
-class StanceConfig:
+class StanceConfig(Config):
     """Scenario key `stance`: which places to stand at are tried."""
 
-    distance_min: float = 0.70  # shoulder axis to the panel's axis point, along the floor [m]
-    distance_max: float = 0.84
-    distance_step: float = 0.02
-    standoff: float = 0.12  # hands start and end this far from the grasp, against the wrist camera's view [m]
-    arc_step: float = 0.27  # between two poses of the turn that are tried [rad]
-    margin_enough: float = 0.9  # an arm margin with which the search for a better stance ends
-    margin_min: float = 0.15  # least arm margin that is accepted (1 is comfortable)
+    KEY = "stance"
+    distance_min: float = number(0.70, 0.5, 1.2, "shoulder axis to the panel's axis point, along the floor [m]")
+    distance_max: float = number(0.84, 0.5, 1.2, "the farthest that is tried [m]")
+    distance_step: float = number(0.02, 0.005, 0.2, "between two distances; halving it doubles the search [m]")
+    standoff: float = number(
+        0.12, 0.02, 0.3, "hands start and end this far from the grasp, against the wrist camera's view [m]"
+    )
+    arc_step: float = number(
+        0.27, 0.1, 1.0, "between two poses of the turn that are tried; halving it doubles the search [rad]"
+    )
+    margin_enough: float = number(0.9, 0.01, 1.0, "an arm margin with which the search for a better stance ends")
+    margin_min: float = number(0.15, 0.01, 1.0, "least arm margin that is accepted (1 is comfortable)")
 
-    def check(self) -> None:
-        require_positive(self, "stance", vars(self))
-        require_in(self.distance_min, 0.5, self.distance_max, "stance.distance_min")
+    def relations(self, key: str) -> None:
+        span = self.distance_max - self.distance_min
+        require(span >= 0, f"{key}.distance_min", f"at most distance_max, {self.distance_max:g}", self.distance_min)
+        few = span <= (MAX_PLACES - 1) * self.distance_step
+        least = span / (MAX_PLACES - 1)
+        require(few, f"{key}.distance_step", f"at least {least:.3g}: {MAX_PLACES} distances", self.distance_step)
 
 
 def turned(X_AV: np.ndarray, angle: float) -> np.ndarray:

@@ -26,7 +26,8 @@ import dataclasses as dc
 import numpy as np
 
 from valve_drake.behaviors.grasp_geometry import standoff
-from valve_drake.checks import require_in, require_positive
+from valve_drake.checks import require
+from valve_drake.config import Config, number
 from valve_drake.frames import cross, make, rotation, wrap
 from valve_drake.kinematics import RobotGeometry
 from valve_drake.messages import (
@@ -48,40 +49,46 @@ AT_VALVE = (Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE)  # the 
 
 
 @dc.dataclass
-class HybridRotationConfig:
+class HybridRotationConfig(Config):
     """Scenario key `hybrid_rotation`."""
 
-    damping: float = 4000.0  # D, of each hand: stable on a wire that is 20 ms late each way [N s/m]
-    angular_damping: float = 256.0  # [N m s/rad]
-    filter: float = 10.0  # low-pass of the wrenches [Hz]
-    rate: float = 0.105  # of the turn [rad/s]
-    ramp: float = 0.5  # to full rate and back [s]
-    slow: float = 0.006  # least rate near the goal [rad/s]
-    torque_limit: float = 12.0  # on the valve; the rate goes to zero over its last 30 % [N m]
-    lead_limit: float = 0.05  # commanded ahead of measured angle, second line of defence [rad]
-    force_trip: float = 55.0  # of one hand: stop [N]
-    squeeze: float = 0.0  # along the bar [N]
-    tolerance: float = 0.001  # of the turned angle, by the hands [rad]
-    stall_time: float = 2.0  # without progress [s]
-    stall_angle: float = 0.01  # that counts as progress [rad]
-    back_off: float = 0.07  # tried the other way after a stall [rad]
-    grip_force: float = 70.0  # of the finger actuator [N]
-    grip_margin: float = 0.005  # opening off the handle's width that is no grasp [m]
-    tug_force: float = 8.0  # that proves the grasp, each hand [N]
-    tug_speed: float = 0.006  # times `damping`: most of its force on a hand [m/s]
-    tug_reach: float = 0.012  # without force: missed [m]
-    close_time: float = 4.0  # deadline for closing [s]
-    relax: float = 0.6  # bleeding the wrenches before opening [s]
-    opening: float = 0.085  # [m]
-    open_force: float = 40.0  # [N]
-    retreat: float = 0.12  # hands drawn back after opening [m]
-    retreat_speed: float = 0.10  # [m/s]
-    tare_time: float = 0.2  # time constant of the wrist sensors' tare at the stand-off [s]
+    KEY = "hybrid_rotation"
+    damping: float = number(
+        4000.0, 500.0, 20000.0, "D of each hand, stable on a wire that is 20 ms late; raise it if they swing [N s/m]"
+    )
+    angular_damping: float = number(256.0, 16.0, 2000.0, "the same for rotations [N m s/rad]")
+    filter: float = number(10.0, 1.0, 60.0, "low-pass of the wrenches [Hz]")
+    rate: float = number(0.105, 0.005, 0.5, "of the turn [rad/s]")
+    ramp: float = number(0.5, 0.05, 5.0, "to full rate and back [s]")
+    slow: float = number(0.006, 5e-4, 0.1, "least rate near the goal [rad/s]")
+    torque_limit: float = number(12.0, 1.0, 16.0, "on the valve; the rate goes to zero over its last 30 % [N m]")
+    lead_limit: float = number(
+        0.05, 0.005, 0.2, "commanded ahead of measured angle, at most: second line of defence [rad]"
+    )
+    force_trip: float = number(55.0, 10.0, 55.0, "on one hand: the turn ends [N]")
+    squeeze: float = number(0.0, 0.0, 30.0, "along the bar [N]")
+    tolerance: float = number(0.001, 1e-4, 0.05, "of the turned angle, by the hands [rad]")
+    stall_time: float = number(2.0, 0.2, 30.0, "without progress [s]")
+    stall_angle: float = number(0.01, 0.001, 0.2, "that counts as progress [rad]")
+    back_off: float = number(0.07, 0.005, 0.5, "tried the other way after a stall [rad]")
+    grip_force: float = number(70.0, 5.0, 100.0, "of the finger actuator [N]")
+    grip_margin: float = number(0.005, 5e-4, 0.02, "opening off the handle's width that is no grasp [m]")
+    tug_force: float = number(8.0, 1.0, 30.0, "that proves the grasp, each hand [N]")
+    tug_speed: float = number(0.006, 0.001, 0.02, "times `damping`: most of its force on a hand [m/s]")
+    tug_reach: float = number(0.012, 0.002, 0.05, "moved so far without force: missed [m]")
+    close_time: float = number(4.0, 0.5, 30.0, "deadline for closing [s]")
+    relax: float = number(0.6, 0.05, 10.0, "bleeding the wrenches before opening [s]")
+    opening: float = number(0.085, 0.03, 0.09, "of the gripper [m]")
+    open_force: float = number(40.0, 5.0, 100.0, "of the finger actuator while opening [N]")
+    retreat: float = number(0.12, 0.02, 0.3, "hands drawn back after opening [m]")
+    retreat_speed: float = number(0.10, 0.01, 0.3, "[m/s]")
+    tare_time: float = number(0.2, 0.02, 2.0, "time constant of the wrist sensors' tare at the stand-off [s]")
 
-    def check(self) -> None:
-        require_positive(self, "hybrid_rotation", [name for name in vars(self) if name != "squeeze"])
-        require_in(self.squeeze, 0.0, 30.0, "hybrid_rotation.squeeze")
-        require_in(self.torque_limit, 1.0, 16.0, "hybrid_rotation.torque_limit")
+    def relations(self, key: str) -> None:
+        require(self.slow <= self.rate, f"{key}.slow", f"at most rate, {self.rate:g}", self.slow)
+        highest = self.force_trip / self.damping
+        gentle = self.tug_speed <= highest
+        require(gentle, f"{key}.tug_speed", f"at most force_trip / damping, {highest:.3g}", self.tug_speed)
 
 
 def gravity_wrench(R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.ndarray:

@@ -23,7 +23,7 @@ import dataclasses as dc
 import numpy as np
 
 from valve_drake.behaviors.taught import TaughtReference
-from valve_drake.checks import require, require_positive
+from valve_drake.config import Config, number
 from valve_drake.frames import make
 from valve_drake.kinematics import RobotGeometry
 from valve_drake.messages import (
@@ -43,22 +43,19 @@ from valve_drake.messages import (
 
 
 @dc.dataclass
-class ImageServoConfig:
+class ImageServoConfig(Config):
     """Scenario key `image_servo`."""
 
-    gain: float = 0.5  # of (3), per image
-    speed: float = 0.06  # of the hand [m/s]
-    tolerance: float = 0.0015  # distance from the reference that counts as there [m]
-    images_in_tolerance: int = 3
-    lost_after: float = 1.0  # without a mark [s]
-    sag: float = 0.003  # most of the hand's way short of its command that is made up for [m]
-    reach: float = 0.20  # farther from the start of servoing than this is a runaway [m]
-    opening: float = 0.085  # [m]
-    gripper_force: float = 40.0  # [N]
-
-    def check(self) -> None:
-        require_positive(self, "image_servo", vars(self))
-        require(self.gain < 1.0, "image_servo.gain", "< 1 (one image of delay)", self.gain)
+    KEY = "image_servo"
+    gain: float = number(0.5, 0.01, 0.95, "of (3), per image; below 1, for one image of delay")
+    speed: float = number(0.06, 0.005, 0.2, "of the hand [m/s]")
+    tolerance: float = number(0.0015, 2e-4, 0.02, "distance from the reference that counts as there [m]")
+    images_in_tolerance: int = number(3, 1, 30, "in a row end it")
+    lost_after: float = number(1.0, 0.1, 30.0, "without a mark [s]")
+    sag: float = number(0.003, 1e-4, 0.02, "servo error that is compensated, at most; larger ones mean contact [m]")
+    reach: float = number(0.20, 0.02, 0.5, "farther from the start of servoing than this is a runaway [m]")
+    opening: float = number(0.085, 0.03, 0.09, "of the gripper [m]")
+    gripper_force: float = number(40.0, 5.0, 100.0, "of the finger actuator [N]")
 
 
 @dc.dataclass(frozen=True)

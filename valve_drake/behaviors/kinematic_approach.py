@@ -26,7 +26,7 @@ from valve_drake.behaviors.grasp_geometry import (
     turned,
 )
 from valve_drake.behaviors.joint_path import Path, find_path
-from valve_drake.checks import require, require_positive
+from valve_drake.config import Config, number, numbers
 from valve_drake.frames import compose, inverse, planar, wrap
 from valve_drake.kinematics import ARM_LIMITS, RobotGeometry, both_arms, lateral
 from valve_drake.messages import (
@@ -50,28 +50,32 @@ from valve_drake.perception.rectangle_estimator import fuse
 
 
 @dc.dataclass
-class KinematicApproachConfig:
+class KinematicApproachConfig(Config):
     """Scenario key `kinematic_approach`."""
 
-    home: list[float] = dc.field(default_factory=lambda: [1.05, 0.65, -1.9, 0.0, 1.25, 0.0])  # left arm; mirrored [rad]
-    joint_speed: float = 0.9  # of the fastest joint [rad/s]
-    joint_acceleration: float = 2.0  # [rad/s^2]
-    settle: float = 0.3  # stillness before a measurement [s]
-    rest: float = 0.8  # stillness at the stand-off, in which the wrist sensors are tared [s]
-    frames: int = 6  # estimates of one measurement at rest
-    mark_ratio: float = 0.9  # sqrt(area) of the green mark over the taught one at which reaching ends
-    opening: float = 0.085  # gripper open [m]
-    gripper_force: float = 40.0  # while opening [N]
-    stance_period: float = 0.5  # between two searches for the stance [s]
-    angle_tolerance: float = 0.035  # camera angle against the command that counts as turned [rad]
-    still_rate: float = 0.0017  # a valve that turns slower stands still; its final angle is taken then [rad/s]
-    still_time: float = 1.5  # estimates of so long tell how fast it turns; longer tells a slower drift [s]
-    look_time: float = 8.0  # verify gives up looking after this: no marker, or the valve does not stand still [s]
-
-    def check(self) -> None:
-        require(len(self.home) == 6, "kinematic_approach.home", "6 joint angles", self.home)
-        names = [name for name in vars(self) if name != "home"]
-        require_positive(self, "kinematic_approach", names)
+    KEY = "kinematic_approach"
+    home: list[float] = numbers(
+        [1.05, 0.65, -1.9, 0.0, 1.25, 0.0], (-ARM_LIMITS).tolist(), ARM_LIMITS.tolist(), "left arm; mirrored [rad]"
+    )
+    joint_speed: float = number(0.9, 0.05, 2.5, "of the fastest joint [rad/s]")
+    joint_acceleration: float = number(2.0, 0.1, 20.0, "[rad/s^2]")
+    settle: float = number(0.3, 0.05, 5.0, "stillness before a measurement [s]")
+    rest: float = number(0.8, 0.05, 10.0, "stillness at the stand-off, in which the wrist sensors are tared [s]")
+    frames: int = number(6, 1, 50, "estimates of one measurement at rest")
+    mark_ratio: float = number(0.9, 0.3, 1.5, "sqrt(area) of the green mark over the taught one at which reaching ends")
+    opening: float = number(0.085, 0.03, 0.09, "gripper open [m]")
+    gripper_force: float = number(40.0, 5.0, 100.0, "while opening [N]")
+    stance_period: float = number(0.5, 0.1, 10.0, "between two searches for the stance [s]")
+    angle_tolerance: float = number(0.035, 0.002, 0.2, "camera angle against the command that counts as turned [rad]")
+    still_rate: float = number(
+        0.0017, 1e-4, 0.05, "a valve that turns slower stands still; its final angle is taken then [rad/s]"
+    )
+    still_time: float = number(
+        1.5, 0.2, 10.0, "estimates of so long tell how fast it turns; longer tells a slower drift [s]"
+    )
+    look_time: float = number(
+        8.0, 0.5, 60.0, "verify gives up looking after this: no marker, or the valve does not stand still [s]"
+    )
 
 
 @dc.dataclass(frozen=True)

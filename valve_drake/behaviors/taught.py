@@ -5,8 +5,8 @@ import pathlib
 from collections.abc import Mapping
 
 import numpy as np
-import yaml
 
+from valve_drake import outputs, yaml_file
 from valve_drake.checks import ConfigError, require
 from valve_drake.messages import SIDES
 
@@ -39,17 +39,11 @@ class TaughtReference:
 
 
 def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
-    """Both hands' references. Raises ConfigError that names the file and the key."""
-    try:
-        data = yaml.safe_load(pathlib.Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"taught references {path}: cannot be read ({type(error).__name__})") from error
-    require(
-        isinstance(data, dict) and set(data) == set(SIDES),
-        f"taught references {path}",
-        "a mapping of left and right",
-        data,
-    )
+    """Both hands' references. Raises ConfigError that names the file and the key, and never shows a foreign file."""
+    source = f"taught references {path}"
+    data = yaml_file.read(path, source=source)
+    if not isinstance(data, dict) or set(data) != set(SIDES):
+        raise ConfigError(f"{source}: no taught references: must be a mapping of left and right")
     out = {}
     for side in SIDES:
         values = {}
@@ -57,7 +51,7 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
             key = f"taught references {path}: {side}.{name}"
             try:
                 value = np.array(data[side][name], float)
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
                 raise ConfigError(f"{key} must be {shape} numbers") from error
             require(
                 value.shape == shape and bool(np.isfinite(value).all()), key, f"{shape} finite numbers", value.tolist()
@@ -74,6 +68,4 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
 def save_taught(taught: Mapping[str, TaughtReference], path: str | pathlib.Path, comment: str) -> None:
     """Writes what `load_taught` reads."""
     data = {side: {name: np.asarray(getattr(taught[side], name)).tolist() for name in _SHAPES} for side in SIDES}
-    lines = "".join(f"# {line}\n" for line in comment.splitlines())
-    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)
-    pathlib.Path(path).write_text(lines + text, encoding="utf-8")
+    outputs.write(path, yaml_file.dump(data, comment))

@@ -18,7 +18,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from valve_drake.checks import require, require_positive
+from valve_drake.checks import require
+from valve_drake.config import Config, number, numbers
 from valve_drake.frames import apply, wrap
 from valve_drake.messages import (
     Command,
@@ -39,36 +40,39 @@ WATCHING = (*DRIVING, Mode.MEASURE)  # a marker that is lost matters
 
 
 @dc.dataclass
-class ValveSearchConfig:
+class ValveSearchConfig(Config):
     """Scenario key `valve_search`."""
 
-    sweep_yaw: float = 1.4  # neck yaw at the ends of a sweep [rad]
-    sweep_waist: float = 0.5  # waist twist there [rad]
-    sweep_speed: float = 1.0  # of the gaze [rad/s]
-    pitches: list[float] = dc.field(default_factory=lambda: [0.15, 0.4, -0.05])  # neck pitch of each round [rad]
-    turn_speed: float = 0.8  # of the base between sweeps [rad/s]
-    turn_acceleration: float = 1.0  # [rad/s^2]
-    sightings: int = 3  # that must agree
-    spread: float = 0.05  # agreement: this share of the distance, or 3 sigma
-    confirm_time: float = 1.0  # a sighting has to be confirmed within [s]
-    skip_time: float = 0.5  # then images are ignored while the sweep moves on [s]
-    lost_after: float = 2.0  # without a sighting while driving or measuring [s]
-    jump: float = 0.5  # a sighting this far from the last is believed only when the old place is empty [m]
-    jump_after: float = 0.5  # for so long [s]
-    neck_speed: float = 1.5  # [rad/s]
-    waist_speed: float = 0.4  # [rad/s]
-    acceleration: float = 5.0  # of waist and neck [rad/s^2]
-    yaw_limit: float = 1.55  # +- [rad]
-    pitch_low: float = -0.45  # [rad]
-    pitch_high: float = 1.05  # [rad]
+    KEY = "valve_search"
+    sweep_yaw: float = number(1.4, 0.1, 1.6, "neck yaw at the ends of a sweep [rad]")
+    sweep_waist: float = number(0.5, 0.01, 0.6, "waist twist there [rad]")
+    sweep_speed: float = number(1.0, 0.05, 3.0, "of the gaze [rad/s]")
+    pitches: list[float] = numbers([0.15, 0.4, -0.05], -0.5, 1.1, "neck pitch of each round [rad]", count=(1, 20))
+    turn_speed: float = number(0.8, 0.05, 2.0, "of the base between sweeps [rad/s]")
+    turn_acceleration: float = number(1.0, 0.1, 4.0, "[rad/s^2]")
+    sightings: int = number(3, 1, 20, "that must agree")
+    spread: float = number(0.05, 0.005, 0.5, "agreement: this share of the distance, or 3 sigma")
+    confirm_time: float = number(1.0, 0.1, 10.0, "a sighting has to be confirmed within [s]")
+    skip_time: float = number(0.5, 0.05, 10.0, "then images are ignored while the sweep moves on [s]")
+    lost_after: float = number(2.0, 0.2, 30.0, "without a sighting while driving or measuring [s]")
+    jump: float = number(
+        0.5, 0.05, 5.0, "a sighting this far from the last is believed only when the old place is empty [m]"
+    )
+    jump_after: float = number(0.5, 0.05, 10.0, "for so long [s]")
+    neck_speed: float = number(1.5, 0.1, 3.0, "[rad/s]")
+    waist_speed: float = number(0.4, 0.05, 1.5, "[rad/s]")
+    acceleration: float = number(5.0, 0.2, 20.0, "of waist and neck [rad/s^2]")
+    yaw_limit: float = number(1.55, 0.1, 1.6, "of the neck, to both sides [rad]")
+    pitch_low: float = number(-0.45, -0.5, 1.1, "of the neck [rad]")
+    pitch_high: float = number(1.05, -0.5, 1.1, "of the neck [rad]")
 
-    def check(self) -> None:
-        block = "valve_search"
-        require_positive(self, block, [n for n in vars(self) if n not in ("pitches", "pitch_low")])
-        require(self.pitch_low < self.pitch_high, f"{block}.pitch_low", "below pitch_high", self.pitch_low)
-        within = len(self.pitches) > 0 and all(self.pitch_low <= p <= self.pitch_high for p in self.pitches)
-        require(within, f"{block}.pitches", f"angles within [{self.pitch_low}, {self.pitch_high}]", self.pitches)
-        require(self.sweep_yaw <= self.yaw_limit, f"{block}.sweep_yaw", "at most yaw_limit", self.sweep_yaw)
+    def relations(self, key: str) -> None:
+        low, high = self.pitch_low, self.pitch_high
+        require(low < high, f"{key}.pitch_low", f"below pitch_high, {high:g}", low)
+        within = all(low <= pitch <= high for pitch in self.pitches)
+        require(within, f"{key}.pitches", f"within pitch_low and pitch_high, [{low:g}, {high:g}]", self.pitches)
+        within = self.sweep_yaw <= self.yaw_limit
+        require(within, f"{key}.sweep_yaw", f"at most yaw_limit, {self.yaw_limit:g}", self.sweep_yaw)
 
 
 @dc.dataclass(frozen=True, eq=False)

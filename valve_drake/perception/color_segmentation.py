@@ -13,7 +13,8 @@ import dataclasses as dc
 import cv2
 import numpy as np
 
-from valve_drake.checks import require, require_in
+from valve_drake.checks import require
+from valve_drake.config import Config, number, plain, table
 from valve_drake.messages import CameraFrame, MarkerCandidate, Mode, Segmentation
 from valve_drake.perception.marker import NEXT
 
@@ -29,49 +30,43 @@ _EVERY = {"search": 1, "measure": 1, "verify": 2}
 _EVERY |= {"rough_approach": 4, "fine_approach": 2}  # odometry is good for half a second
 _EVERY |= {mode: 16 for mode in ("reach", "servo", "grasp", "turn", "release", "retreat")}  # for the log
 _EVERY |= {mode: 0 for mode in ("idle", "done", "failed", "stopped")}
-
-
-def check_every(every: dict[str, int], key: str) -> None:
-    """`every` maps names of modes to whole numbers >= 0."""
-    modes = [mode.value for mode in Mode]
-    for mode, n in every.items():
-        require(mode in modes, key, f"keyed by modes ({', '.join(modes)})", mode)
-        require(isinstance(n, int) and not isinstance(n, bool) and n >= 0, f"{key}.{mode}", "a whole number >= 0", n)
+MODES = tuple(mode.value for mode in Mode)
 
 
 @dc.dataclass
-class ColorSegmentationConfig:
-    min_contrast: float = 18.0  # of the colour's share against the neighbourhood, to look closer [%]
-    min_opponent: float = 24.0  # of R - (G + B) / 2 between inside and surroundings [grey levels]
-    small_box: int = 61  # neighbourhoods whose mean is compared with [px of the full image]
-    large_box: int = 301
-    min_area: float = 60.0  # of a marker [px^2]
-    min_green_area: float = 12.0  # of a green mark [px^2]
-    min_fill: float = 0.86  # region's area over its quadrilateral's, and the inverse
-    max_aspect: float = 3.2  # long side over short side in the image (65 deg oblique makes 2.4 of a square)
-    border: int = 3  # a region this near to the image's border is cut off [px]
-    max_candidates: int = 12  # regions judged per image, largest contrast x area first
-    follow: bool = True  # look only round the last candidates, and everywhere if they are gone
-    full_every: int = 4  # and everywhere at every n-th look
-    every: dict[str, int] = dc.field(default_factory=lambda: dict(_EVERY))  # mode -> look every n-th step, 0 = never
+class RegionConfig(Config):
+    """What a coloured region has to be to be looked at closer."""
 
-    def check(self) -> None:
-        for name, low, high in (
-            ("min_contrast", 1, 100),
-            ("min_opponent", 1, 200),
-            ("small_box", 5, 2000),
-            ("large_box", 5, 4000),
-            ("min_area", 9, 1e6),
-            ("min_green_area", 4, 1e6),
-            ("min_fill", 0.5, 1),
-            ("max_aspect", 1, 20),
-            ("border", 0, 100),
-            ("max_candidates", 1, 1000),
-            ("full_every", 1, 1000),
-        ):
-            require_in(getattr(self, name), low, high, f"color_segmentation.{name}")
-        check_every(self.every, "color_segmentation.every")
-        require(self.large_box > self.small_box, "color_segmentation.large_box", "> small_box", self.large_box)
+    KEY = "handle_marker.segmentation"
+    min_contrast: float = number(
+        18.0, 1.0, 100.0, "of the colour's share against the neighbourhood, to look closer; lower it in faint light [%]"
+    )
+    small_box: int = number(61, 5, 2000, "neighbourhood whose mean is compared with [px of the full image]")
+    large_box: int = number(301, 5, 4000, "and a larger one, for large markers [px of the full image]")
+    min_area: float = number(60.0, 9.0, 1e6, "of a marker [px^2]")
+    max_aspect: float = number(
+        3.2, 1.0, 20.0, "long side over short side in the image (65 deg oblique makes 2.4 of a square)"
+    )
+    max_candidates: int = number(12, 1, 1000, "regions judged per image, largest contrast x area first")
+
+    def relations(self, key: str) -> None:
+        require(
+            self.large_box > self.small_box, f"{key}.large_box", f"above small_box, {self.small_box}", self.large_box
+        )
+
+
+@dc.dataclass
+class ColorSegmentationConfig(RegionConfig):
+    """Scenario key `color_segmentation`."""
+
+    KEY = "color_segmentation"
+    min_opponent: float = number(24.0, 1.0, 200.0, "of R - (G + B) / 2 between inside and surroundings [grey levels]")
+    min_green_area: float = number(12.0, 4.0, 1e6, "of a green mark [px^2]")
+    min_fill: float = number(0.86, 0.5, 1.0, "region's area over its quadrilateral's, and the inverse")
+    border: int = number(3, 0, 100, "a region this near to the image's border is cut off [px]")
+    follow: bool = plain(True, "look only round the last candidates, and everywhere if they are gone")
+    full_every: int = number(4, 1, 1000, "and everywhere at every n-th look")
+    every: dict[str, int] = table(_EVERY, 0, 1000, "in each mode: look every n-th step, 0 = never", MODES)
 
 
 @dc.dataclass(frozen=True)
@@ -109,7 +104,7 @@ def segmented(
     return Segmentation(frame=frame, candidates=candidates, green=green)
 
 
-def green_regions(image: np.ndarray, config: ColorSegmentationConfig) -> list[Region]:
+def green_regions(image: np.ndarray, config: RegionConfig) -> list[Region]:
     """Green regions cut out at full resolution, for the wrist cameras."""
     return _regions(image, _Half.of(image, (0, 0)), config, "green")[0]
 
@@ -184,7 +179,7 @@ def _shares(image: np.ndarray) -> dict[str, np.ndarray]:
     return {name: cv2.divide(color, light, scale=100) for name, color in zip(_COLORS, colors)}
 
 
-def _contrast(share: np.ndarray, config: ColorSegmentationConfig) -> np.ndarray:
+def _contrast(share: np.ndarray, config: RegionConfig) -> np.ndarray:
     """Largest excess of a colour's share over its means in both neighbourhoods; uint8.
 
     Less of it than usual in the image does not count: grey beside green is not red under a warm light.
@@ -209,7 +204,7 @@ def _outlines(mask: np.ndarray) -> list[np.ndarray]:
 
 
 def _regions(
-    image: np.ndarray, half: _Half, config: ColorSegmentationConfig, color: str
+    image: np.ndarray, half: _Half, config: RegionConfig, color: str
 ) -> tuple[list[Region], list[MarkerCandidate]]:
     """Regions cut out at full resolution, and those that their coarse outline already rules out."""
     contrast = _contrast(half.share[color], config)
@@ -237,7 +232,7 @@ def _regions(
 
 
 def _coarse_reason(
-    outline: np.ndarray, box: tuple[int, int, int, int], shape: tuple[int, ...], config: ColorSegmentationConfig
+    outline: np.ndarray, box: tuple[int, int, int, int], shape: tuple[int, ...], config: RegionConfig
 ) -> str:
     """Why a half-resolution outline cannot be the marker, or ""; generous, the fine outline decides."""
     x, y, w, h = box

@@ -8,49 +8,38 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.checks import require_in
+from valve_drake.config import Config, number, table
 from valve_drake.messages import HandleMark
 from valve_drake.perception.color_segmentation import (
-    ColorSegmentationConfig,
+    MODES,
     Region,
-    check_every,
+    RegionConfig,
     green_regions,
     middle,
     polygon_area,
     quadrilateral,
 )
-from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads, meet, side_lines
+from valve_drake.perception.line_fitting import SidesConfig, fit_quads, meet, side_lines
 from valve_drake.perception.marker import NEXT
 
 
 @dc.dataclass
-class HandleMarkerConfig:
-    # Marks fill much of a wrist image: the neighbourhoods are larger than the head cameras'.
-    segmentation: ColorSegmentationConfig = dc.field(
-        default_factory=lambda: ColorSegmentationConfig(small_box=181, large_box=561, min_area=150, max_candidates=6)
-    )
-    lines: LineFittingConfig = dc.field(
-        default_factory=lambda: LineFittingConfig(color_only=True, reach=0.12, together=False)
-    )
-    border: int = 3  # a mark this near to the image's border is cut off [px]
-    min_fill: float = 0.85  # region's area over its quadrilateral's, and the inverse
-    max_aspect: float = 4.0  # long side over short side in the image
-    center_weight: float = 1.0  # how much nearness to the image's centre counts against size
-    every: dict[str, int] = dc.field(
-        default_factory=lambda: {"reach": 4, "servo": 1, "grasp": 16}
-    )  # mode -> look every n-th step; 0 or missing = never
+class HandleMarkerConfig(Config):
+    """Scenario key `handle_marker`."""
 
-    def check(self) -> None:
-        self.segmentation.check()
-        self.lines.check()
-        for name, low, high in (
-            ("border", 0, 100),
-            ("min_fill", 0.3, 1),
-            ("max_aspect", 1, 20),
-            ("center_weight", 0, 100),
-        ):
-            require_in(getattr(self, name), low, high, f"handle_marker.{name}")
-        check_every(self.every, "handle_marker.every")
+    KEY = "handle_marker"
+    # Marks fill much of a wrist image: the neighbourhoods are larger than the head cameras'.
+    segmentation: RegionConfig = dc.field(
+        default_factory=lambda: RegionConfig(small_box=181, large_box=561, min_area=150.0, max_candidates=6)
+    )
+    lines: SidesConfig = dc.field(default_factory=lambda: SidesConfig(color_only=True, reach=0.12, together=False))
+    border: int = number(3, 0, 100, "a mark this near to the image's border is cut off [px]")
+    min_fill: float = number(0.85, 0.3, 1.0, "region's area over its quadrilateral's, and the inverse")
+    max_aspect: float = number(4.0, 1.0, 20.0, "long side over short side in the image")
+    center_weight: float = number(1.0, 0.0, 100.0, "how much nearness to the image's centre counts against size")
+    every: dict[str, int] = table(
+        {"reach": 4, "servo": 1, "grasp": 16}, 0, 1000, "in each mode: look every n-th step, 0 or none = never", MODES
+    )
 
 
 def find_mark(image: np.ndarray, config: HandleMarkerConfig) -> HandleMark:

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from valve_drake.camera.lens import LensModel, StereoHead
-from valve_drake.checks import require_in
+from valve_drake.config import Config, number, plain
 from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, SegmentationPair
 from valve_drake.perception.edge_profiles import ROW, Sheet, Terms, gram, moments, normal_cdf, normal_density
 from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, basis, joint_fit, meet, sums
@@ -47,31 +47,34 @@ _SHARP = 0.8  # blur that is looked for first: a lens in focus, and the pixel it
 
 
 @dc.dataclass
-class LineFittingConfig:
-    half_window: int = 8  # of a profile [px]; shorter on small quadrilaterals and towards the corners
-    reach: float = 0.15  # of half a profile over the quadrilateral's width, at most; the surroundings are plain there
-    trim: float = 2.5  # of a side at each corner, beyond the profile's reach [px]
-    gamma: float = 1.0  # light = value^gamma; 1 if pixel values are linear in light, 2.2 for ordinary cameras
-    iterations: int = 5
-    together: bool = True  # all sides and their corners are fitted once more with what they share
-    max_sigma: float = 0.4  # scatter of the edge points about the side [px]
-    min_contrast: float = 10.0  # between inside and outside [grey levels, over all channels]
-    min_share: float = 0.5  # of a side's profiles that must fit
-    color_only: bool = False  # compare colours and not brightness: for a mark whose surroundings are bright and dark
-    single_camera: bool = False  # one camera is enough if the other sees no marker, or no sides of it
+class SidesConfig(Config):
+    """How the sides of one quadrilateral are fitted."""
 
-    def check(self) -> None:
-        for name, low, high in (
-            ("half_window", 3, 20),
-            ("reach", 0.02, 0.5),
-            ("trim", 0, 20),
-            ("gamma", 0.3, 4),
-            ("iterations", 2, 20),
-            ("max_sigma", 0.01, 5),
-            ("min_contrast", 1, 255),
-            ("min_share", 0.1, 1),
-        ):
-            require_in(getattr(self, name), low, high, f"line_fitting.{name}")
+    KEY = "handle_marker.lines"
+    half_window: int = number(8, 3, 20, "of a profile; shorter on small quadrilaterals and towards the corners [px]")
+    reach: float = number(
+        0.15, 0.02, 0.5, "of half a profile over the quadrilateral's width, at most; the surroundings are plain there"
+    )
+    trim: float = number(2.5, 0.0, 20.0, "of a side at each corner, beyond the profile's reach [px]")
+    gamma: float = number(
+        1.0, 0.3, 4.0, "light = value^gamma; 1 if pixel values are linear in light, 2.2 for ordinary cameras"
+    )
+    iterations: int = number(5, 2, 20, "of the fit of each side")
+    together: bool = plain(True, "all sides and their corners are fitted once more with what they share")
+    max_sigma: float = number(0.4, 0.01, 5.0, "scatter of the edge points about the side [px]")
+    min_contrast: float = number(10.0, 1.0, 255.0, "between inside and outside [grey levels, over all channels]")
+    min_share: float = number(0.5, 0.1, 1.0, "of a side's profiles that must fit")
+    color_only: bool = plain(
+        False, "compare colours and not brightness: for a mark whose surroundings are bright and dark"
+    )
+
+
+@dc.dataclass
+class LineFittingConfig(SidesConfig):
+    """Scenario key `line_fitting`."""
+
+    KEY = "line_fitting"
+    single_camera: bool = plain(False, "one camera is enough if the other sees no marker, or no sides of it")
 
 
 @dc.dataclass(frozen=True)
@@ -154,7 +157,7 @@ def _edges_of(
     )
 
 
-def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: LineFittingConfig) -> list[RawQuad]:
+def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: SidesConfig) -> list[RawQuad]:
     """Edge points of one quadrilateral in each image (H, W, 3) uint8 RGB, within about 2 px of corners (4, 2) [px].
 
     Corners go clockwise as seen. All are fitted in one pass, which costs little more than one.
@@ -224,7 +227,7 @@ def side_lines(points: np.ndarray, side: np.ndarray, sides: int = 4) -> tuple[np
     return lines, math.sqrt(max(square, 0.0) / max(len(points) - 2 * sides, 1))
 
 
-def _mix(part: np.ndarray, corners: np.ndarray, config: LineFittingConfig) -> tuple[np.ndarray, float]:
+def _mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np.ndarray, float]:
     """One linear channel, float32: about 1 inside, about 0 outside; and the contrast it has [grey levels]."""
     step = 2 if (corners.max(0) - corners.min(0)).max() > _LARGE else 1
     small, corners = _every(part, step), corners / step
@@ -371,9 +374,7 @@ class _Sides:
         return _Sides(*(values[own] for values in vars(self).values()))
 
 
-def _place(
-    sheet: Sheet, corners: np.ndarray, config: LineFittingConfig, least: float = 0.0
-) -> tuple[_Sides, list[str]]:
+def _place(sheet: Sheet, corners: np.ndarray, config: SidesConfig, least: float = 0.0) -> tuple[_Sides, list[str]]:
     """Lays the profiles across the sides of coarse quadrilaterals (Q, 4, 2); and why it cannot, or "", for each.
 
     least: half a profile's length that blur calls for, if the opposite side is far enough [px].
@@ -431,7 +432,7 @@ class _Followed:
     blur: np.ndarray  # ... and the one found
 
 
-def _fit_sides(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> list[RawQuad]:
+def _fit_sides(sheet: Sheet, sides: _Sides, config: SidesConfig) -> list[RawQuad]:
     """Steps 3 and 4 for all quadrilaterals together."""
     found = _follow(sheet, sides, config)
     out, scatter = _judged(found, config)
@@ -449,7 +450,7 @@ def _fit_sides(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> list[R
     return out
 
 
-def _follow(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> _Followed:
+def _follow(sheet: Sheet, sides: _Sides, config: SidesConfig) -> _Followed:
     """Step 3, as arrays (S sides, M pixels, N profiles)."""
     Q = len(sides.half)
     flat, first, count, start, slope, inward = (
@@ -563,7 +564,7 @@ def _follow(sheet: Sheet, sides: _Sides, config: LineFittingConfig) -> _Followed
     )
 
 
-def _judged(found: _Followed, config: LineFittingConfig) -> tuple[list[RawQuad], np.ndarray]:
+def _judged(found: _Followed, config: SidesConfig) -> tuple[list[RawQuad], np.ndarray]:
     """Each quadrilateral's edge points, or why it is none; and the points' scatter (Q, 2), see `joint_fit`."""
     Q = len(found.blur) // 4
 

@@ -26,7 +26,8 @@ import numpy as np
 
 from valve_drake import frames
 from valve_drake.camera.lens import LensModel, StereoHead
-from valve_drake.checks import require, require_in
+from valve_drake.checks import require
+from valve_drake.config import Config, choice, number
 from valve_drake.messages import MarkerEdges, QuadEdges, RectangleEstimate
 from valve_drake.perception.joint_fit import NODES
 from valve_drake.perception.line_fitting import meet, side_lines
@@ -49,45 +50,38 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @dc.dataclass
-class RectangleEstimatorConfig:
-    method: str = "refined"  # refined | paper
-    fine_step: str = "paper"  # of method paper: paper = eq. (22), (23); exact = ray and plane; none
-    loss: str = "tukey"  # tukey | huber | none
-    loss_width: float = 4.7  # residual beyond which a point counts less [sigma]
-    min_sigma: float = 0.01  # an edge point is not believed better than this [px]
-    side_bias: float = 0.003  # what all points of a side have in common: lens, plate, renderer [px]
-    yaw_sigma: float = 0.0  # of the head cameras' relative yaw, then estimated as well; 0 = known [rad]
-    square_tolerance: float = 0.05  # sides that differ by less do not tell which is X [relative]
-    ambiguity_gate: float = 9.0  # chi^2 by which the mirror image must be worse; below, the track decides
-    max_residual: float = 0.8  # rms of the edge points about the fit [px]
-    size_gate: float = 0.1  # difference of distance by triangulation and by the fit that is allowed [relative]
-    min_distance: float = 0.25  # [m]
-    max_distance: float = 6.0  # [m]
-    max_tilt: float = 1.13  # of the marker against the line of sight [rad]
-    max_iterations: int = 15
-    track_timeout: float = 3.0  # the X axis is not followed over a longer gap [s]
+class RectangleEstimatorConfig(Config):
+    """Scenario key `rectangle_estimator`."""
 
-    def check(self) -> None:
-        key = "rectangle_estimator"
-        require(self.method in METHODS, f"{key}.method", f"one of {', '.join(METHODS)}", self.method)
-        require(self.fine_step in ("paper", "exact", "none"), f"{key}.fine_step", "paper, exact, none", self.fine_step)
-        require(self.loss in ("tukey", "huber", "none"), f"{key}.loss", "one of tukey, huber, none", self.loss)
-        for name, low, high in (
-            ("loss_width", 1, 1e6),
-            ("min_sigma", 1e-6, 10),
-            ("side_bias", 0, 10),
-            ("yaw_sigma", 0, 0.2),
-            ("square_tolerance", 0, 1),
-            ("ambiguity_gate", 0, 1e6),
-            ("max_residual", 1e-3, 100),
-            ("size_gate", 1e-3, 10),
-            ("min_distance", 0.01, 100),
-            ("max_distance", self.min_distance, 100),
-            ("max_tilt", 0.1, 1.56),
-            ("max_iterations", 1, 200),
-            ("track_timeout", 0, 1e6),
-        ):
-            require_in(getattr(self, name), low, high, f"{key}.{name}")
+    KEY = "rectangle_estimator"
+    method: str = choice("refined", METHODS, "of the pose")
+    fine_step: str = choice(
+        "paper", ("paper", "exact", "none"), "of method paper: paper = eq. (22), (23); exact = ray and plane"
+    )
+    loss: str = choice("tukey", ("tukey", "huber", "none"), "of the edge points' residuals")
+    loss_width: float = number(4.7, 1.0, 1e6, "residual beyond which a point counts less [sigma]")
+    min_sigma: float = number(0.01, 1e-6, 10.0, "an edge point is not believed better than this [px]")
+    side_bias: float = number(0.003, 0.0, 10.0, "what all points of a side have in common: lens, plate, renderer [px]")
+    yaw_sigma: float = number(
+        0.0, 0.0, 0.2, "of the head cameras' relative yaw, then estimated as well; 0 = known [rad]"
+    )
+    square_tolerance: float = number(0.05, 0.0, 1.0, "sides that differ by less do not tell which is X [relative]")
+    ambiguity_gate: float = number(
+        9.0, 0.0, 1e6, "chi^2 by which the mirror image must be worse; below, the track decides"
+    )
+    max_residual: float = number(0.8, 1e-3, 100.0, "rms of the edge points about the fit [px]")
+    size_gate: float = number(
+        0.1, 1e-3, 10.0, "difference of distance by triangulation and by the fit that is allowed [relative]"
+    )
+    min_distance: float = number(0.25, 0.01, 100.0, "of a marker [m]")
+    max_distance: float = number(6.0, 0.01, 100.0, "of a marker [m]")
+    max_tilt: float = number(1.13, 0.1, 1.56, "of the marker against the line of sight [rad]")
+    max_iterations: int = number(15, 1, 200, "of the refinement")
+    track_timeout: float = number(3.0, 0.0, 3600.0, "the X axis is not followed over a longer gap [s]")
+
+    def relations(self, key: str) -> None:
+        ordered = self.min_distance <= self.max_distance
+        require(ordered, f"{key}.max_distance", f"at least min_distance, {self.min_distance:g}", self.max_distance)
 
 
 @dc.dataclass(frozen=True)

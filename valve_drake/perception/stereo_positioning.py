@@ -13,7 +13,8 @@ import numpy as np
 
 from valve_drake import frames
 from valve_drake.camera.lens import LensModel, StereoHead
-from valve_drake.checks import require_in
+from valve_drake.checks import require
+from valve_drake.config import Config, number
 from valve_drake.messages import MarkerCandidate, SegmentationPair, StereoPosition
 from valve_drake.perception.color_segmentation import middle, polygon_area
 from valve_drake.perception.marker import NEXT, Marker
@@ -24,32 +25,34 @@ _PINHOLE, _NO_DISTORTION = np.eye(3), np.zeros(4)
 
 
 @dc.dataclass
-class StereoPositioningConfig:
-    center_sigma: float = 0.5  # of the red area's centre [px]
-    epipolar_gate: float = 4.0  # distance from the epipolar line that is allowed [px]
-    size_gate: float = 0.18  # relative difference of depth by triangulation and by size that is allowed
-    corner_sigma: float = 1.0  # of a candidate's coarse corners, widens both gates on small ones [px]
-    shape_gate: float = 0.08  # misfit of the coarse corners to the rectangle, as a share of its size
-    side_gate: float = 0.08  # relative error of a side's length, measured by both cameras together, that is allowed
-    side_sigma: float = 0.3  # of a fitted corner's disparity, beside the calibration's; widens that gate [px]
-    yaw_sigma: float = 0.0  # of the relative yaw of the two cameras, for the covariance only; 0 = known [rad]
-    min_distance: float = 0.25  # [m]
-    max_distance: float = 6.5  # [m]
+class StereoPositioningConfig(Config):
+    """Scenario key `stereo_positioning`."""
 
-    def check(self) -> None:
-        for name, low, high in (
-            ("center_sigma", 1e-3, 20),
-            ("epipolar_gate", 0.1, 100),
-            ("size_gate", 0.01, 1),
-            ("corner_sigma", 0, 20),
-            ("shape_gate", 0.01, 1),
-            ("side_gate", 0.01, 10),
-            ("side_sigma", 0, 20),
-            ("yaw_sigma", 0, 0.2),
-            ("min_distance", 0.01, 100),
-            ("max_distance", self.min_distance, 100),
-        ):
-            require_in(getattr(self, name), low, high, f"stereo_positioning.{name}")
+    KEY = "stereo_positioning"
+    center_sigma: float = number(0.5, 1e-3, 20.0, "of the red area's centre [px]")
+    epipolar_gate: float = number(4.0, 0.1, 100.0, "distance from the epipolar line that is allowed [px]")
+    size_gate: float = number(
+        0.18, 0.01, 1.0, "relative difference of depth by triangulation and by size that is allowed"
+    )
+    corner_sigma: float = number(
+        1.0, 0.0, 20.0, "of a candidate's coarse corners, widens both gates on small ones [px]"
+    )
+    shape_gate: float = number(0.08, 0.01, 1.0, "misfit of the coarse corners to the rectangle, as a share of its size")
+    side_gate: float = number(
+        0.08, 0.01, 10.0, "relative error of a side's length, measured by both cameras together, that is allowed"
+    )
+    side_sigma: float = number(
+        0.3, 0.0, 20.0, "of a fitted corner's disparity, beside the calibration's; widens that gate [px]"
+    )
+    yaw_sigma: float = number(
+        0.0, 0.0, 0.2, "of the relative yaw of the two cameras, for the covariance only; 0 = known [rad]"
+    )
+    min_distance: float = number(0.25, 0.01, 100.0, "of a marker [m]")
+    max_distance: float = number(6.5, 0.01, 100.0, "of a marker [m]")
+
+    def relations(self, key: str) -> None:
+        ordered = self.min_distance <= self.max_distance
+        require(ordered, f"{key}.max_distance", f"at least min_distance, {self.min_distance:g}", self.max_distance)
 
 
 @dc.dataclass(frozen=True)

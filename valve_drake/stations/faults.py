@@ -25,7 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from valve_drake.checks import require, require_in
+from valve_drake.checks import require
+from valve_drake.config import Config, choice, number
 from valve_drake.messages import Mode
 from valve_drake.ports import TICK
 from valve_drake.stations.lcm_channels import CHANNELS, DEVICES, JOINTS
@@ -35,32 +36,28 @@ DEVICE = ("frozen", "nan", "dead", "restart", "stuck", "estop")
 
 
 @dc.dataclass
-class FaultConfig:
+class FaultConfig(Config):
     """One entry of the scenario's key `faults`."""
 
-    kind: str = "latency"
-    device: str = ""
-    mode: str = ""  # begins with this mode; "": with the run
-    start: float = 0.0  # after that [s]
-    duration: float = 0.0  # 0: to the end [s]
-    share: float = 0.0  # of messages
-    delay: float = 0.0  # [s]
-    jitter: float = 0.0  # half the width of an even spread [s]
-    joint: int = 0
+    KEY = "faults"
+    kind: str = choice("latency", WIRE + DEVICE, "what goes wrong")
+    device: str = choice("", ("", *DEVICES), "of which; empty: of all")
+    mode: str = choice("", ("", *(mode.value for mode in Mode)), "begins with this mode; empty: with the run")
+    start: float = number(0.0, 0.0, 3600.0, "after that [s]")
+    duration: float = number(0.0, 0.0, 3600.0, "0: to the end [s]")
+    share: float = number(0.0, 0.0, 1.0, "of messages")
+    delay: float = number(0.0, 0.0, 5.0, "of messages [s]")
+    jitter: float = number(0.0, 0.0, 5.0, "half the width of an even spread of the delay [s]")
+    joint: int = number(0, 0, 5, "that is stuck")
 
-    def check(self) -> None:
-        require(self.kind in WIRE + DEVICE, "faults.kind", " or ".join(WIRE + DEVICE), self.kind)
-        require(self.device in ("", *DEVICES), "faults.device", f'"" or one of {", ".join(DEVICES)}', self.device)
-        require(self.mode in ("", *Mode), "faults.mode", f'"" or one of {", ".join(Mode)}', self.mode)
-        for key, high in (("start", 3600), ("duration", 3600), ("share", 1), ("delay", 5), ("jitter", 5)):
-            require_in(getattr(self, key), 0, high, f"faults.{key}")
-        require(self.jitter <= self.delay, "faults.jitter", "not above the delay", self.jitter)
+    def relations(self, key: str) -> None:
+        require(self.jitter <= self.delay, f"{key}.jitter", f"at most the delay, {self.delay:g}", self.jitter)
         if self.kind == "restart":
-            require(self.duration > 0, "faults.duration", "> 0 for a restart", self.duration)
+            require(self.duration > 0, f"{key}.duration", "> 0 for a restart", self.duration)
         if self.kind == "stuck":
             count = JOINTS.get(self.device, 0)
-            require(count > 0, "faults.device", f"one of {', '.join(JOINTS)} for stuck", self.device)
-            require(0 <= self.joint < count, "faults.joint", f"within 0..{count - 1}", self.joint)
+            require(count > 0, f"{key}.device", f"one of {', '.join(JOINTS)} for stuck", self.device)
+            require(self.joint < count, f"{key}.joint", f"within [0, {count - 1}]", self.joint)
 
 
 class Faults:

@@ -23,7 +23,8 @@ from drake import (
 )
 
 from valve_drake.camera.image_file import jpeg_size
-from valve_drake.checks import require, require_in
+from valve_drake.checks import require
+from valve_drake.config import Config, number, numbers, plain, texts
 from valve_drake.messages import REMEMBERED, SIDES, CameraFrame, Mode
 from valve_drake.ports import SLOT, TICK
 from valve_drake.stations.contract import CAMERAS
@@ -276,42 +277,41 @@ def table() -> str:
 
 
 @dc.dataclass
-class HardwareConfig:
-    """Scenario key `hardware`: the bus between the program and the robot, and the times that both keep."""
+class HardwareConfig(Config):
+    """Scenario key `hardware`: the bus between the program and the robot, and the times that both keep.
 
-    lcm_url: str = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=2097152"  # room for four images
-    channels: dict[str, str] = dc.field(
-        default_factory=lambda: {row.key: row.default_name for row in CHANNELS.values()}
+    The upper bounds of ages and periods are those that docs/hardware.md promises.
+    """
+
+    KEY = "hardware"
+    lcm_url: str = plain(
+        "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=2097152", "udpm://... or memq://; with room for four images"
     )
-    network: str = LOOPBACK  # interface that the group of lcm_url must be routed to; lo: only this machine is heard
-    key_file: str = ""  # holds the key that signs all messages, the same on both sides; "": they are not signed
-    image_size: list[int] = dc.field(default_factory=lambda: [640, 480])  # of every camera; others are refused [px]
-    lockstep: bool = False  # both sides wait for each other instead of the clock: for rehearsals
-    answer_time: float = 30.0  # a robot that has not reported everything after this long does not answer [s]
-    report_age: float = 0.1  # a wrist sensor silent for longer reads NaN [s]
-    image_age: float = 0.8  # an image older than this is not shown [s]
-    command_age: float = 0.1  # on the robot: without commands for longer its joints stop [s]
-    robot_period: float = 1 / 32  # of robot.state [s]
-    request_period: float = 1 / 32  # of cameras.request [s]
+    network: str = plain(LOOPBACK, "interface that the group of lcm_url is routed to; lo: only this machine is heard")
+    key_file: str = plain(
+        "", "holds the key that signs all messages, the same on both sides; empty: they are not signed"
+    )
+    image_size: list[int] = numbers([640, 480], 16, 4096, "width, height of every camera; others are refused [px]")
+    channels: dict[str, str] = texts({row.key: row.default_name for row in CHANNELS.values()}, "names on the bus")
+    lockstep: bool = plain(False, "both sides wait for each other instead of the clock: for rehearsals")
+    answer_time: float = number(
+        30.0, TICK, 600.0, "a robot that has not reported everything after this long does not answer [s]"
+    )
+    report_age: float = number(0.1, 0.02, 0.1, "a wrist sensor silent for longer reads NaN [s]")
+    image_age: float = number(0.8, TICK, REMEMBERED, "an image older than this is not shown [s]")
+    command_age: float = number(0.1, 0.02, 0.1, "on the robot: without commands for longer its joints stop [s]")
+    robot_period: float = number(1 / 32, TICK, 1 / 32, "of robot.state [s]")
+    request_period: float = number(1 / 32, TICK, 0.25, "of cameras.request [s]")
 
-    def check(self) -> None:
+    def relations(self, key: str) -> None:
         group_of(self.lcm_url)
-        require(bool(NAME.fullmatch(self.network)), "hardware.network", "the name of a network interface", self.network)
-        size = self.image_size
-        good = len(size) == 2 and all(isinstance(n, int) and 1 <= n <= 4096 for n in size)
-        require(good, "hardware.image_size", "width and height, each within [1, 4096] px", size)
-        unknown = sorted(set(self.channels) - set(CHANNELS))
-        require(not unknown, "hardware.channels", f"keyed by {', '.join(CHANNELS)}", ", ".join(unknown))
+        require(bool(NAME.fullmatch(self.network)), f"{key}.network", "the name of a network interface", self.network)
         names = list(self.channels.values())
         twice = sorted({name for name in names if names.count(name) > 1 or not name})
-        require(not twice, "hardware.channels", "a name of its own for each channel", ", ".join(twice))
-        require_in(self.answer_time, TICK, 600.0, "hardware.answer_time")
-        for key in ("report_age", "command_age"):
-            require_in(getattr(self, key), TICK, 60.0, f"hardware.{key}")
-        require_in(self.image_age, TICK, REMEMBERED, "hardware.image_age")
-        for key in ("robot_period", "request_period"):
-            ticks = getattr(self, key) / TICK
-            require(ticks >= 1 and ticks == int(ticks), f"hardware.{key}", "a multiple of 1/128 s", getattr(self, key))
+        require(not twice, f"{key}.channels", "a name of its own for each channel", ", ".join(twice))
+        for name in ("robot_period", "request_period"):
+            ticks = getattr(self, name) / TICK
+            require(ticks == int(ticks), f"{key}.{name}", "a multiple of 1/128 s", getattr(self, name))
 
 
 def to_utime(time: float) -> int:

@@ -16,11 +16,11 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, Multiplexer
+from pydrake.systems.primitives import AffineSystem, ConstantVectorSource, MatrixGain, Multiplexer
 
 from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
-from valve_drake.messages import SIDES, Health
+from valve_drake.messages import DEVICES, SIDES, Health
 from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
@@ -83,10 +83,25 @@ class ServoDriver(LeafSystem):
         output.SetFromVector([x, y, h, *fingers, v * math.cos(h), v * math.sin(h), w, 0.0, 0.0])
 
 
-def _add_servos(builder: DiagramBuilder, plant: MultibodyPlant, scene: Scene, start: np.ndarray) -> ServoDriver:
+def _affine(gain: np.ndarray, offset: np.ndarray) -> AffineSystem:
+    """y = gain u + offset, in C++."""
+    none, (n, m) = np.zeros((0, 0)), gain.shape
+    return AffineSystem(none, np.zeros((0, m)), np.zeros(0), np.zeros((n, 0)), gain, offset)
+
+
+def arm_offsets(error: ErrorConfig, seed: int) -> dict[str, np.ndarray]:
+    """What each arm's encoders read at the joints' true zero: side -> (6,) [rad]."""
+    draw = _rng(seed, 5).standard_normal((2, 6))
+    return {side: error.arm_offset * draw[k] for k, side in enumerate(SIDES)}
+
+
+def _add_servos(
+    builder: DiagramBuilder, plant: MultibodyPlant, scene: Scene, start: np.ndarray, offsets: dict[str, np.ndarray]
+) -> ServoDriver:
     """From the contract's commands to [q_d; v_d] of all actuators. Arms and torso get v_d = 0: they are sent positions.
 
-    All but the base and the fingers is C++, as it runs at every step of the plant.
+    offsets: of `arm_offsets`; an arm goes to where its encoders read the command. All but the base and the fingers is
+    C++, as it runs at every step of the plant.
     """
     actuated = [plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices(scene.robot)]
     n = len(actuated)
@@ -110,7 +125,9 @@ def _add_servos(builder: DiagramBuilder, plant: MultibodyPlant, scene: Scene, st
     for k, joint in enumerate([*BASE, *fingers]):
         order[actuated.index(joint), len(joints) + k] = 1
         order[n + actuated.index(joint), len(joints) + 5 + k] = 1
-    sort = builder.AddSystem(MatrixGain(order))
+    zeros = np.zeros(order.shape[1])
+    zeros[: len(joints)] = np.concatenate([np.zeros(len(TORSO)), *(offsets[side] for side in SIDES)])
+    sort = builder.AddSystem(_affine(order, -order @ zeros))
     sort.set_name("servo_order")
     for k, port in enumerate(parts):
         builder.ExportInput(every.get_input_port(k), port)
@@ -221,7 +238,7 @@ class HealthSystem(Block[Inputs, None]):
     """The simulated machine reports that all its devices speak."""
 
     OUTPUTS = {"health": Health}
-    DEVICES = ("base", "torso", *(f"{s}_{d}" for s in SIDES for d in ("arm", "gripper", "wrist_sensor")), *CAMERAS)
+    DEVICES = tuple(device for device in DEVICES if device != "robot")
 
     def __init__(self) -> None:
         super().__init__("health", period=1 / 32, slot=0)
@@ -361,10 +378,12 @@ def make_simulated_station(
     scene = add_scene(plant, valve, marker_size)
     plant.Finalize()
     start = start_pose(simulation.start, valve)
-    _set_start(plant, scene, simulation, start, home, opening)
+    offsets = arm_offsets(simulation.error, seed)
+    arms = home - np.concatenate([offsets[side] for side in SIDES])  # home is what the encoders read
+    _set_start(plant, scene, simulation, start, arms, opening)
     joints = Joints(plant, scene)
 
-    driver = _add_servos(builder, plant, scene, start)
+    driver = _add_servos(builder, plant, scene, start, offsets)
     still = builder.AddSystem(ConstantVectorSource(np.zeros(2)))
     still.set_name("valve_at_rest")
     builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(scene.valve))
@@ -382,7 +401,8 @@ def make_simulated_station(
     builder.Connect(actuation.get_output_port(), plant.get_actuation_input_port(scene.robot))
 
     def measure(port: str, names: list[str], what: str, factor: float = 1.0, offset: np.ndarray | None = None) -> None:
-        gain = builder.AddSystem(MatrixGain(factor * joints.select(names, what)))
+        matrix = factor * joints.select(names, what)
+        gain = builder.AddSystem(MatrixGain(matrix) if offset is None else _affine(matrix, offset))
         gain.set_name(port)
         torque = what == "torque"
         source = plant.get_net_actuation_output_port(scene.robot) if torque else plant.get_state_output_port()
@@ -391,7 +411,7 @@ def make_simulated_station(
 
     measure("torso.position_measured", list(TORSO), "position")
     for side in SIDES:
-        measure(f"{side}_arm.position_measured", arm_joints(side), "position")
+        measure(f"{side}_arm.position_measured", arm_joints(side), "position", offset=offsets[side])
         measure(f"{side}_arm.velocity_measured", arm_joints(side), "velocity")
         measure(f"{side}_arm.torque_measured", arm_joints(side), "torque")
         measure(f"{side}_gripper.position_measured", [f"{side}_finger_1"], "position", 2.0)
@@ -447,13 +467,13 @@ def _set_start(
     scene: Scene,
     simulation: SimulationConfig,
     start: np.ndarray,
-    home: np.ndarray,
+    arms: np.ndarray,
     opening: float,
 ) -> None:
-    """Default positions of all joints: where the run begins."""
+    """Default positions of all joints: where the run begins. arms: true angles of both (12,) [rad]."""
     values = dict(zip(BASE, start))
     for k, side in enumerate(SIDES):
-        values |= dict(zip(arm_joints(side), home[6 * k : 6 * k + 6]))
+        values |= dict(zip(arm_joints(side), arms[6 * k : 6 * k + 6]))
         values |= {f"{side}_finger_{finger}": opening / 2 for finger in (1, 2)}
     for name, value in values.items():
         plant.GetJointByName(name, scene.robot).set_default_positions([value])

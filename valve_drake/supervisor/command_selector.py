@@ -15,7 +15,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from valve_drake.checks import ConfigError, require, require_positive
+from valve_drake.checks import ConfigError, require
+from valve_drake.config import Config, number, numbers
+from valve_drake.kinematics import ARM_LIMITS
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, Health, Mode, ModeState, RobotState, SelectorReport
 from valve_drake.motion import follow, slew
 
@@ -72,43 +74,38 @@ SOURCE: dict[Mode, dict[str, str]] = {
 
 
 @dc.dataclass
-class CommandSelectorConfig:
-    """Scenario key `command_selector`. Lists are per joint, in the order of the station's ports."""
+class CommandSelectorConfig(Config):
+    """Scenario key `command_selector`. Lists are per joint, in the order of the station's ports.
 
-    base_speed: list[float] = dc.field(default_factory=lambda: [0.8, 1.2])  # forward [m/s], yaw rate [rad/s]
-    base_acceleration: list[float] = dc.field(default_factory=lambda: [0.8, 2.0])  # [m/s^2], [rad/s^2]
-    torso_low: list[float] = dc.field(default_factory=lambda: [-0.6, -0.5, -1.6])  # waist, neck pitch, neck yaw [rad]
-    torso_high: list[float] = dc.field(default_factory=lambda: [0.6, 1.1, 1.6])  # [rad]
-    torso_speed: list[float] = dc.field(default_factory=lambda: [0.8, 1.6, 1.6])  # [rad/s]
-    torso_acceleration: list[float] = dc.field(default_factory=lambda: [6.0, 6.0, 6.0])  # [rad/s^2]
-    arm_limit: list[float] = dc.field(default_factory=lambda: [2.97, 2.09, 2.62, 3.32, 2.09, 3.14])  # +- [rad]
-    arm_speed: list[float] = dc.field(default_factory=lambda: [1.2, 1.2, 1.2, 2.0, 2.0, 2.0])  # [rad/s]
-    arm_acceleration: list[float] = dc.field(default_factory=lambda: [8.0] * 6)  # [rad/s^2]
-    gripper_high: float = 0.09  # opening; the lower limit is 0 [m]
-    gripper_speed: float = 0.1  # [m/s]
-    gripper_acceleration: float = 2.0  # [m/s^2]
-    gripper_force: float = 80.0  # [N]
-    max_age: float = 0.1  # of a command, a device's report, the robot's state and the mode, before the robot holds [s]
-    trip_force: float = 90.0  # raw force at a wrist sensor, gravity included, that trips [N]
-    trip_ticks: int = 3  # ticks in a row above it
-    follow_error: float = 0.15  # of arms and torso behind their command [rad]
-    follow_speed: float = 0.25  # of the base off its command [m/s, rad/s]
-    follow_time: float = 0.25  # for so long: the group does not follow [s]
+    Upper bounds are the robot's own limits (models/robot/robot.sdf), and the times and forces of docs/hardware.md: a
+    scenario can be stricter than what is promised there, and never laxer.
+    """
 
-    def check(self) -> None:
-        block = "command_selector"
-        sizes = {"base": 2, "torso": 3, "arm": 6}
-        for name, value in vars(self).items():
-            if not isinstance(value, list):
-                continue
-            size = sizes[name.split("_")[0]]
-            good = len(value) == size and all(np.isfinite(value))
-            require(good, f"{block}.{name}", f"{size} finite numbers", value)
-            if name not in ("torso_low", "torso_high"):
-                require(min(value) > 0, f"{block}.{name}", "above zero", value)
+    KEY = "command_selector"
+    base_speed: list[float] = numbers([0.8, 1.2], 0.05, (1.5, 2.0), "forward, yaw rate [m/s, rad/s]")
+    base_acceleration: list[float] = numbers([0.8, 2.0], 0.1, (1.5, 4.0), "forward, yaw rate [m/s^2, rad/s^2]")
+    torso_low: list[float] = numbers([-0.6, -0.5, -1.6], (-0.6, -0.5, -1.6), 0.0, "waist, neck pitch, neck yaw [rad]")
+    torso_high: list[float] = numbers([0.6, 1.1, 1.6], 0.0, (0.6, 1.1, 1.6), "waist, neck pitch, neck yaw [rad]")
+    torso_speed: list[float] = numbers([0.8, 1.6, 1.6], 0.05, (1.5, 3.0, 3.0), "[rad/s]")
+    torso_acceleration: list[float] = numbers([6.0, 6.0, 6.0], 0.5, 20.0, "[rad/s^2]")
+    arm_speed: list[float] = numbers([1.2, 1.2, 1.2, 2.0, 2.0, 2.0], 0.05, (2.5, 2.5, 2.5, 4.0, 4.0, 4.0), "[rad/s]")
+    arm_acceleration: list[float] = numbers([8.0] * 6, 0.5, 20.0, "[rad/s^2]")
+    gripper_high: float = number(0.09, 0.03, 0.09, "opening; the lower limit is 0 [m]")
+    gripper_speed: float = number(0.1, 0.01, 0.2, "[m/s]")
+    gripper_acceleration: float = number(2.0, 0.1, 10.0, "[m/s^2]")
+    gripper_force: float = number(80.0, 5.0, 100.0, "of the finger actuator [N]")
+    max_age: float = number(
+        0.1, 0.02, 0.1, "of a command, a device's report, the robot's state and the mode, before the robot holds [s]"
+    )
+    trip_force: float = number(90.0, 10.0, 90.0, "raw force at a wrist sensor, gravity included, that trips [N]")
+    trip_ticks: int = number(3, 1, 3, "ticks in a row above it")
+    follow_error: float = number(0.15, 0.02, 0.15, "of arms and torso behind their command [rad]")
+    follow_speed: float = number(0.25, 0.02, 0.25, "of the base off its command [m/s, rad/s]")
+    follow_time: float = number(0.25, 0.03, 0.25, "for so long: the group does not follow [s]")
+
+    def relations(self, key: str) -> None:
         below = all(low < high for low, high in zip(self.torso_low, self.torso_high))
-        require(below, f"{block}.torso_low", f"below torso_high {self.torso_high}", self.torso_low)
-        require_positive(self, block, [n for n, v in vars(self).items() if not isinstance(v, list)])
+        require(below, f"{key}.torso_low", f"below torso_high, {self.torso_high}", self.torso_low)
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -130,8 +127,8 @@ def bounds(config: CommandSelectorConfig) -> Bounds:
         return np.array([*torso, *arm, *arm, gripper, gripper])
 
     return Bounds(
-        low=joints(c.torso_low, [-x for x in c.arm_limit], 0.0),
-        high=joints(c.torso_high, c.arm_limit, c.gripper_high),
+        low=joints(c.torso_low, (-ARM_LIMITS).tolist(), 0.0),
+        high=joints(c.torso_high, ARM_LIMITS.tolist(), c.gripper_high),
         speed=joints(c.torso_speed, c.arm_speed, c.gripper_speed),
         acceleration=joints(c.torso_acceleration, c.arm_acceleration, c.gripper_acceleration),
         base_speed=np.array(c.base_speed),
