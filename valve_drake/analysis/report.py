@@ -30,6 +30,7 @@ from valve_drake.pace import PACE, Pace
 from valve_drake.recording.container import LIBRARY
 from valve_drake.recording.reader import LogReader
 
+MADE = "Made by <code>valve-drake review</code>"  # in every page, see the templates
 AT_REST = (Mode.MEASURE, Mode.VERIFY)
 MOMENTS = 200  # changes of mode that are shown with pictures
 ROW = 22  # of the timeline [px]
@@ -210,9 +211,7 @@ def plain(value: Any) -> Any:
 
 def was_made(path: Path) -> bool:
     """Whether a file is a page that `review` made."""
-    with open(path, "rb") as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - 1000))
-        return b"Made by <code>valve-drake review</code>" in file.read()
+    return MADE.encode() in path.read_bytes()
 
 
 # ---------------------------------------------------------------- the page

@@ -382,10 +382,17 @@ class _Pass:
                 framed = record is not None and record.opcode in _NAMES and self._follows(record.end, limit, 1)
                 after = record.end if record is not None and framed else self._next_sound(position, limit)
                 opcode = record.opcode if record is not None and framed else None
-                closed = self.data_end is not None
-                self.gaps.append(_Gap(len(self.log._blocks), position, after - position, opcode, reason, closed))
+                self._add_gap(position, after, opcode, reason)
             position = after
         self.end = position
+
+    def _add_gap(self, position: int, end: int, opcode: int | None, reason: str) -> None:
+        before = self.gaps[-1] if self.gaps else None
+        if before and before.position + before.size == position and not (before.reason or reason):
+            before.size, before.opcode = end - before.position, None
+        else:
+            closed = self.data_end is not None
+            self.gaps.append(_Gap(len(self.log._blocks), position, end - position, opcode, reason, closed))
 
     def _take(self, record: Frame, position: int, limit: int) -> int:
         """Keeps what a sound record says -> where the next begins."""
@@ -471,19 +478,22 @@ class _Pass:
         found = mcap_records.scan(self.data, position, limit, only_messages=True)
         if len(found.positions) == 0:
             raise Unsound
+        self.loose = True
         if not self._follows(found.end, limit, 1):  # the last one's length may be what is damaged
             last = int(found.positions[-1])
-            if (better := self._next_sound(last, found.end)) < found.end:
+            better = min(self._next_sound(last, limit), found.end)
+            if better < found.end or self._torn(found.end):
                 if last == position:
                     raise Unsound
-                found = found._replace(positions=found.positions[:-1], end=last)
-                self.loose = True
-                self.log._add_block(None, self.data, found, position)
-                self.gaps.append(_Gap(len(self.log._blocks), last, better - last, None, "", False))
+                self.log._add_block(None, self.data, found._replace(positions=found.positions[:-1], end=last), position)
+                self._add_gap(last, better, None, "")
                 return better
-        self.loose = True
         self.log._add_block(None, self.data, found, position)
         return found.end
+
+    def _torn(self, end: int) -> bool:
+        """Whether zeros lie across the end of a record: a disk that lost power had only a part of it."""
+        return not any(self.data[end - 4 : end + 4])
 
     def _define(self, record: Frame, definition: Schema | Channel) -> None:
         """Takes a definition unless one of its id is known."""
@@ -501,7 +511,7 @@ class _Pass:
     # ---- where a sound record begins
 
     def _follows(self, position: int, limit: int, count: int) -> bool:
-        """Whether records that this program knows begin here, one after the other, or the file ends."""
+        """Whether so many records begin here, one after the other, or the file ends; none of a private kind if many."""
         for _ in range(count):
             if position == limit:
                 return True
@@ -509,7 +519,7 @@ class _Pass:
                 record = mcap_records.frame(self.data, position, limit)
             except Unsound:
                 return False
-            known = record.opcode in _NAMES or (record.opcode >= 0x80 and self.log.library != LIBRARY)
+            known = record.opcode in _NAMES or (count == 1 and self.log.library != LIBRARY)
             if not known or (record.opcode == Opcode.MESSAGE and record.end - record.start < mcap_records.LEAST):
                 return False
             position = record.end
