@@ -572,6 +572,21 @@ def test_an_image_that_claims_the_right_size_and_has_another_one_is_not_decoded(
     assert look(puppet, puppet.step(), "left_wrist").sequence == -1
 
 
+def test_images_that_come_too_late_are_no_news_and_a_fault_if_that_goes_on(puppet):
+    puppet.step(8)
+    words = "left_wrist: images come 0.9 s after they were taken, want 0.8 s"
+    faults = []
+    for k in range(200):
+        if k % 32 == 0:
+            puppet.image("left_wrist", k, noise(k), ago=0.9)
+        shown = puppet.step()
+        assert look(puppet, shown, "left_wrist").sequence == -1
+        puppet.link.send(puppet.tick * TICK, values(1, IN))
+        faults.append(words in shown.health.faults)
+    assert not any(faults[:112]) and all(faults[128:])
+    assert puppet.age(shown, "left_wrist") > 1.0
+
+
 def test_an_image_from_the_future_is_no_news(puppet):
     puppet.step(8)
     puppet.image("left_wrist", 3, noise(1), ago=-0.5)

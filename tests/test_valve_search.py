@@ -29,24 +29,28 @@ def in_view(X_OL: np.ndarray, p_OV: np.ndarray, shift: float = 0.0) -> bool:
 
 @dc.dataclass
 class World:
-    """A robot that follows commands with a lag, and stereo sightings 8 times a second, 30 ms late."""
+    """A robot that follows commands with a lag, and stereo sightings at most 8 times a second.
+
+    A pair of images takes `late` to be made, and the next one is begun when it is there.
+    """
 
     p_OV: np.ndarray | None  # the marker, if there is one
     rng: np.random.Generator
     base: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))
     rate: float = 0.0
     torso: np.ndarray = dc.field(default_factory=lambda: np.array([0.0, 0.1, 0.0]))
+    late: float = 0.03  # [s]
     ghosts: float = 0.0  # chance that an image without the marker shows something anywhere in view
     pending: list = dc.field(default_factory=list)
     position: StereoPosition = StereoPosition()
 
     def tick(self, k: int) -> RobotState:
         t = k * DT
-        if k % 8 == 0:
-            X_OL = HEAD(self.base, self.torso)
-            self.pending.append((t + 0.03, self._shot(t, k // 8, X_OL)))
         if self.pending and self.pending[0][0] <= t:
             self.position = self.pending.pop(0)[1]
+        if k % 8 == 0 and not self.pending:
+            X_OL = HEAD(self.base, self.torso)
+            self.pending.append((t + self.late, self._shot(t, k // 8, X_OL)))
         odometry = np.array([*self.base, 0.0, self.rate])
         return RobotState(time=t, odometry=odometry, torso=self.torso, history=np.array([[t, *self.base, *self.torso]]))
 
@@ -114,6 +118,22 @@ def test_search_finds_the_marker_wherever_it_is(bearing, distance, height):
     assert time < 45
 
 
+@pytest.mark.parametrize("late", [0.2, 0.4, 0.6, 0.79])
+@pytest.mark.parametrize("bearing", [0.4, -2.2])
+def test_a_slow_camera_makes_the_search_slower_and_not_blind(bearing, late):
+    p_OV = around(bearing, 3.0, 1.0)
+    status, time, _, memory = search(World(p_OV, np.random.default_rng(3), late=late))
+    assert status.state == "succeeded", status.detail
+    assert np.linalg.norm(memory.target - p_OV) < 0.15 and time < 40
+
+
+def test_without_images_the_gaze_waits_where_nothing_is_missed():
+    world = World(around(1.5, 3.0, 1.0), np.random.default_rng(3), late=1e9)
+    status, _, torsos, _ = search(world, limit=10)
+    assert status.state == "running"
+    assert np.abs(torsos[:, 0] + torsos[:, 2]).max() < CONFIG.ahead + 0.05
+
+
 def test_search_of_a_marker_within_the_first_half_circle_takes_under_12_s():
     for bearing, distance in itertools.product((-1.5, 0.7), (2.5, 4.5)):
         status, time, _, _ = search(World(around(bearing, distance, 1.0), np.random.default_rng(1)))
@@ -152,8 +172,11 @@ def test_search_looks_aside_for_a_second_then_moves_on_deaf_then_listens_again()
     robot, mode, memory = RobotState(history=np.zeros((1, 7))), ModeState(mode="search", activation=1), Memory()
     gaze, position, shown = [], StereoPosition(), (0.5, 1.75, 2.5)  # one sighting at each of these times
     for k in range(int(3 / DT)):
-        if k * DT in shown:
-            position = StereoPosition(time=k * DT, found=True, p_LV=np.array([k * DT, 0, 3.0]))
+        if k % 8 == 0 and memory.torso is not None:
+            X_OL = HEAD(np.zeros(3), memory.torso)
+            position = StereoPosition(time=k * DT, X_OL=X_OL)
+            if k * DT in shown:
+                position = dc.replace(position, found=True, p_LV=np.array([k * DT, 0, 3.0]))
         memory, _, status = step(CONFIG, memory, k * DT, DT, robot, mode, position, RectangleEstimate(), HEAD)
         gaze.append(memory.gaze)
     sweeping = np.diff(gaze) != 0
@@ -359,9 +382,9 @@ def test_ports():
     }
 
 
-def test_block_sweeps_with_open_perception_ports():
+def test_block_begins_its_sweep_with_open_perception_ports_and_waits_for_an_image():
     dut = rig().run(1.0)
-    assert abs(dut.read("command").torso[2]) > 0.3
+    assert 0.2 < abs(dut.read("command").torso[2]) < CONFIG.ahead
     assert dut.read("command").base_twist is not None
     assert (dut.read("status").activation, dut.read("status").state) == (1, "running")
 

@@ -6,6 +6,7 @@ Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base w
              that the gaze goes on over what is new, and it sweeps back: that is a round, one for each neck pitch in
              `pitches`. A sighting stops the sweep and is centred; it counts when the last `sightings` of stage 1 agree
              within 3 sigma or 5 % of the distance, else the sweep goes on. Fails with not_found after the last round.
+             The gaze waits for images, so that a slow camera makes the search slower and not blind.
     others   The neck keeps the last known p_OV on the optical axis of the left camera, the waist comes back to zero;
              only while driving it helps when the neck is at its end.
              Without a sighting for `lost_after` while driving or measuring: failed with marker_lost.
@@ -52,7 +53,9 @@ class ValveSearchConfig(Config):
     turn_acceleration: float = number(1.0, 0.1, 4.0, "[rad/s^2]")
     sightings: int = number(3, 1, 20, "that must agree")
     spread: float = number(0.05, 0.005, 0.5, "agreement: this share of the distance, or 3 sigma")
-    confirm_time: float = number(1.0, 0.1, 10.0, "a sighting has to be confirmed within [s]")
+    confirm_time: float = number(1.0, 0.1, 10.0, "a sighting has to be confirmed within, [s]")
+    confirm_looks: int = number(5, 1, 100, "or within so many pairs of images, whichever takes longer")
+    ahead: float = number(0.4, 0.05, 1.0, "the gaze waits for images when it is so far ahead of the last one's [rad]")
     skip_time: float = number(0.5, 0.05, 10.0, "then images are ignored while the sweep moves on [s]")
     lost_after: float = number(2.0, 0.2, 30.0, "without a sighting while driving or measuring [s]")
     jump: float = number(
@@ -101,6 +104,9 @@ class Memory:
     turn_rate: float = 0.0  # commanded [rad/s]
     looks: tuple[tuple[np.ndarray, float], ...] = ()  # p_OV [m] and its sigma [m], of the last sightings
     confirm_until: float = -np.inf  # [s]
+    confirm_left: int = 0  # pairs of images that a sighting may still be confirmed by
+    seen_time: float = -np.inf  # capture time of the newest pair of images, whatever it shows [s]
+    seen_azimuth: float = 0.0  # of the left camera's axis then, in O [rad]
     ignore_until: float = -np.inf  # capture time [s]
 
 
@@ -181,6 +187,8 @@ def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
         side=1.0 if gaze >= 0 else -1.0,  # the nearer end first
         gaze=gaze,
         heading=float(base[2]),
+        seen_time=time,
+        seen_azimuth=float(base[2]) + gaze,
     )
 
 
@@ -258,7 +266,7 @@ def _search(
     m = dc.replace(m, heading=float(base[2]), to_turn=m.to_turn - turned if m.to_turn else 0.0)
     if m.result == "running":
         m = _look(config, m, time, position)
-    confirming = time < m.confirm_until
+    confirming = bool(m.looks) and (time < m.confirm_until or m.confirm_left > 0)
     if m.looks and not confirming and m.result == "running":
         m = dc.replace(m, looks=(), ignore_until=time + config.skip_time)
     if confirming or m.result != "running":
@@ -267,11 +275,15 @@ def _search(
             return m, m.goal
         neck = aim(head_pose, base, m.goal, m.looks[-1][0])
         return m, np.array([m.goal[0], *_neck(config, *neck)])
-    return _sweep(config, m, dt)
+    return _sweep(config, m, dt, float(base[2]))
 
 
 def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPosition) -> Memory:
     """Takes a new sighting of both cameras, and decides whether the last ones agree."""
+    if position.time > m.seen_time:
+        axis = position.X_OL[:, 2]
+        azimuth, left = float(np.arctan2(axis[1], axis[0])), max(m.confirm_left - 1, 0)
+        m = dc.replace(m, seen_time=position.time, seen_azimuth=azimuth, confirm_left=left)
     if not position.found or position.time <= max(m.capture_time, m.since, m.ignore_until):
         return m
     p_OV = apply(position.X_OL, position.p_LV)
@@ -280,7 +292,7 @@ def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPos
     sigma = float(np.sqrt(np.trace(position.covariance)))
     looks = (*m.looks, (p_OV, sigma))[-config.sightings :]
     if not m.looks:
-        m = dc.replace(m, confirm_until=time + config.confirm_time)
+        m = dc.replace(m, confirm_until=time + config.confirm_time, confirm_left=config.confirm_looks)
     m = dc.replace(m, looks=looks, capture_time=position.time)
     if not agree(config, looks, position.X_OL[:, 3]):
         return m
@@ -290,7 +302,7 @@ def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPos
     return _end(m, "succeeded", detail=f"marker {distance:.2f} m away, {p_OV[2]:.2f} m high")
 
 
-def _sweep(config: ValveSearchConfig, m: Memory, dt: float) -> tuple[Memory, np.ndarray]:
+def _sweep(config: ValveSearchConfig, m: Memory, dt: float, heading: float) -> tuple[Memory, np.ndarray]:
     """Moves the gaze on, or the base between two sweeps -> memory, torso goal."""
     end = config.sweep_yaw + config.sweep_waist
     pitch = config.pitches[max(m.sweeps, 0) // 2]
@@ -300,6 +312,8 @@ def _sweep(config: ValveSearchConfig, m: Memory, dt: float) -> tuple[Memory, np.
         return dc.replace(m, turn_rate=slew(m.turn_rate, rate, config.turn_acceleration * dt)), goal
     m = dc.replace(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt), to_turn=0.0)
     if np.max(np.abs(goal - m.torso)[1:]) > 0.1:  # the neck is still on its way, after a look aside or a new pitch
+        return m, goal
+    if m.side * wrap(heading + m.gaze - m.seen_azimuth) > config.ahead:  # or a slow camera would miss what is passed
         return m, goal
     gaze = slew(m.gaze, m.side * end, config.sweep_speed * dt)
     m = dc.replace(m, gaze=float(gaze))

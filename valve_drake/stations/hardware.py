@@ -70,7 +70,8 @@ EARLY = 0.1  # an image may be stamped so far ahead of the robot's other reports
 DECODING = 5e-3  # that an image takes, with room [s]
 AHEAD = SLOT / 2  # the station is read this long before a tick, when the last one's slot 3 is done [s of the diagram]
 HEALTH_TICKS = 4  # health is reported every 1/32 s
-PATIENCE = dict.fromkeys(CAMERAS, 0.5) | {"robot": 0.1}  # of devices that do not report every tick (reports.py) [s]
+PATIENCE = {"robot": 0.1}  # of devices that do not report every tick (reports.py) [s]
+PATIENCE |= dict.fromkeys(CAMERAS, 0.5) | {f"{camera} late": 0.9 for camera in CAMERAS}
 NOTICE = 2.0  # a wait for the robot that takes longer is told [s]
 
 
@@ -237,6 +238,12 @@ class RobotLink:
         time = self._placed.setdefault(utime, from_utime(utime) + least)
         while len(self._placed) > 64:
             self._placed.pop(next(iter(self._placed)))
+        late = self._time - time
+        if late > self._config.image_age:  # nobody would be shown it: no news
+            words = f"{camera}: images come {late:.1f} s after they were taken, want {self._config.image_age:g} s"
+            self._bad.bad(f"{camera} late", words, now)
+            return
+        self._bad.good(f"{camera} late", now)
         if time > self._time + EARLY:
             raise WrongMessage(f"an image stamped {time - self._time:.1f} s ahead of the robot's other reports")
         before = -math.inf if last is None else last.arrival
