@@ -239,7 +239,8 @@ def test_a_signal_is_the_operators_stop_and_the_log_is_whole(here, capsys, numbe
 
 
 def test_a_run_that_fails_within_its_duration_exits_1(here, capsys):
-    code, out, _ = command(capsys, "--duration", "1.1", "--log", "a.mcap", "--set", "supervisor.deadline.search=1")
+    away = ["--set", "supervisor.deadline.search=1", "--set", "simulation.start.heading=2.0"]
+    code, out, _ = command(capsys, "--duration", "1.1", "--log", "a.mcap", *away)
     assert code == 1 and "failed  verdict timeout" in out
 
 
