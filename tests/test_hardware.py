@@ -135,6 +135,8 @@ def test_stamps_on_the_grid_of_slots_come_back_exactly():
         ("hardware.channels={base.command: A, torso.command: A}", ["hardware.channels", "A"]),
         ("hardware.lcm_url=udpm://10.0.0.1:7667", ["hardware.lcm_url", "multicast", "10.0.0.1"]),
         ("hardware.network=''", ["hardware.network", "interface"]),
+        ("hardware.channels.base.command=", ["hardware.channels"]),
+        ("hardware.channels={base.command: '" + "x" * 64 + "'}", ["hardware.channels", "63"]),
         ("hardware.image_size=[640]", ["hardware.image_size", "640"]),
         ("hardware.image_size=[640, 100000]", ["hardware.image_size", "100000"]),
         ("hardware.answer_time=0", ["hardware.answer_time"]),

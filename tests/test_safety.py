@@ -196,3 +196,16 @@ def test_whatever_fails_in_whatever_mode_the_robot_comes_to_rest_and_no_hand_is_
         elif fault.kind in ("nan", "estop") or fault.device in ("left_wrist_sensor", "right_wrist_sensor"):
             assert mode == Mode.RELEASE or (seen.left is not None and seen.left < 0.25), (fault, seen)
             assert seen.ended is None or seen.verdict in (Verdict.FAULT, Verdict.TURNED), (fault, seen)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [Mode.SERVO, Mode.GRASP, Mode.TURN])
+def test_the_operators_stop_with_the_hands_at_the_valve_opens_them_and_ends_the_run(at_modes, mode):
+    robot, saved = at_modes
+    robot.restore(saved[mode])
+    diagram.command(robot.system, robot.simulator.get_mutable_context(), OperatorCommand(1, "stop"))
+    seen = robot.suffer(FaultConfig("loss", share=0.0), longest=8.0)
+    assert (seen.mode, seen.verdict) == (Mode.STOPPED, Verdict.STOPPED)
+    assert seen.force < TRIP + MARGIN and seen.moved < seen.ended + 1.0
+    for side in SIDES:
+        assert robot.twin.read(f"{side}_gripper.position_measured")[0] > 0.07

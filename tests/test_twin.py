@@ -575,3 +575,43 @@ def test_real_time_is_kept_and_its_keeping_is_logged(tmp_path):
     assert pace["ticks"] == pytest.approx(640, abs=10) and pace["missed"] < 0.1 * pace["ticks"]
     logged = list(LogReader(tmp_path / "run.mcap").messages(["/pace"]))
     assert len(logged) >= 4 and twin["ticks"] > 640
+
+
+@needs_space
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["INT", "TERM", "HUP"])
+def test_a_signal_is_the_operators_stop_on_a_robot_too_and_the_log_is_complete(tmp_path, name):
+    script = """
+    "$0" -m valve_drake twin --lockstep --seed 1 --json > twin.json & twin=$!
+    "$0" -m valve_drake run hardware.scenario.yaml --lockstep --seed 1 --log run.mcap --json > run.json & run=$!
+    until [ "$(stat -c %s run.mcap.active 2> /dev/null || echo 0)" -gt 300000 ]; do sleep 0.1; done
+    kill -$1 $run
+    wait $run; code=$?
+    wait $twin; exit $code
+    """
+    command = [*SPACE, "timeout", "200", "bash", "-c", script, sys.executable, name]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    assert json.loads((tmp_path / "run.json").read_text())["verdict"] == "stopped"
+    log = LogReader(tmp_path / "run.mcap")
+    assert log.damage == [] and log.metadata["result"]["outcome"] == "stopped"
+    twin = json.loads((tmp_path / "twin.json").read_text())
+    assert twin["valve_angle_true_rad"] == pytest.approx(0, abs=1e-3)
+
+
+@needs_space
+@pytest.mark.slow
+def test_a_twin_that_starts_late_is_waited_for_and_who_comes_second_is_refused(tmp_path):
+    script = """
+    "$0" -m valve_drake run hardware.scenario.yaml --seed 1 --duration 3 --log run.mcap --json > run.json & run=$!
+    sleep 8
+    "$0" -m valve_drake twin --seed 2 --json > twin.json & twin=$!
+    wait $run; echo run $?
+    "$0" -m valve_drake twin --seed 3; echo second $?
+    kill -INT $twin; wait $twin
+    """
+    command = [*SPACE, "timeout", "200", "bash", "-m", "-c", script, sys.executable]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.split()[1::2] == ["0", "1"], done.stderr
+    assert "waiting up to 30 s for the robot: nothing yet on VALVE_BASE_STATUS" in done.stderr
+    assert "another robot or twin is on" in done.stderr and "Traceback" not in done.stderr

@@ -4,8 +4,10 @@
 wire. The scenario's key `hardware` names the channels, the bus and the times that are kept.
 """
 
+import collections
 import dataclasses as dc
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -39,6 +41,7 @@ UNCOUNTED = frozenset((*SYNC.values(), *PRESENCE.values()))  # that lock-step's 
 JOINTS = {"torso": 3, "left_arm": 6, "right_arm": 6}  # of a device: how many
 LOCKSTEP_TIME = 60.0  # lock-step: how long either side may think about one tick [s, wall]
 MM = 1e3  # Drake's gripper messages are in mm
+CHANNEL_NAME = re.compile(r"[!-~]{1,63}")  # LCM drops longer ones
 MOST_NAMES, LONGEST_NAME = 64, 200  # of a message of named numbers
 MOST_SCANS = 20  # of a progressive JPEG: each costs a pass over the image; encoders write about 10
 
@@ -307,7 +310,9 @@ class HardwareConfig(Config):
         group_of(self.lcm_url)
         require(bool(NAME.fullmatch(self.network)), f"{key}.network", "the name of a network interface", self.network)
         names = list(self.channels.values())
-        twice = sorted({name for name in names if names.count(name) > 1 or not name})
+        wrong = [name for name in names if not CHANNEL_NAME.fullmatch(name)]
+        require(not wrong, f"{key}.channels", "names of 1 to 63 letters, digits and signs", wrong)
+        twice = sorted(name for name, count in collections.Counter(names).items() if count > 1)
         require(not twice, f"{key}.channels", "a name of its own for each channel", ", ".join(twice))
         for name in ("robot_period", "request_period"):
             ticks = getattr(self, name) / TICK
