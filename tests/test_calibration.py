@@ -13,7 +13,6 @@ import yaml
 
 from valve_drake import frames
 from valve_drake.camera import calibration as cal
-from valve_drake.camera import hand_eye
 from valve_drake.camera.board import Board, find_corners, find_images, natural, pair_images, parse_board
 from valve_drake.camera.calibration_file import load_calibration, save_camera
 from valve_drake.camera.lens import Lens, OpenCvLens, StereoHead, load_head, save_head
@@ -326,68 +325,8 @@ def test_frontal_boards_at_known_distances_are_one_target():
     assert np.linalg.norm(fit.X_LR[:, 3]) == pytest.approx(np.linalg.norm(X_LR[:, 3]), rel=0.02)
 
 
-# ---------------------------------------------------------------- hand-eye
-
 X_EC = frames.make(frames.rotation(np.array([0.1, -0.2, 1.5])), np.array([0.05, -0.02, 0.08]))
 X_BT = frames.make(frames.rotation(np.array([3.0, 0.1, 0.2])), np.array([0.6, 0.1, 0.02]))
-
-
-def hand_poses(n: int = 8, two_axes: bool = True) -> list[np.ndarray]:
-    """X_BE that keep the board in view."""
-    rng, out = np.random.default_rng(21), []
-    for _ in range(n):
-        w = rng.uniform(-0.5, 0.5, 3) * (1, two_axes, two_axes)
-        p = np.array([*rng.uniform(-0.05, 0.05, 2), 0.4])
-        X_TC = frames.inverse(frames.make(frames.rotation(w), p))
-        out.append(frames.compose(X_BT, X_TC, frames.inverse(X_EC)))
-    return out
-
-
-def board_seen(X_BE: np.ndarray, sigma: float = 0.0, rng: np.random.Generator | None = None) -> np.ndarray:
-    X_CT = frames.compose(frames.inverse(X_EC), frames.inverse(X_BE), X_BT)
-    px = boards.corners(PAPER, X_CT, BOARD.points())
-    return px if rng is None else px + rng.normal(0, sigma, px.shape)
-
-
-def test_hand_eye_of_exact_poses_is_exact():
-    X_BE = hand_poses()
-    X_CT = [frames.compose(frames.inverse(X_EC), frames.inverse(X), X_BT) for X in X_BE]
-    np.testing.assert_allclose(hand_eye.closed_hand_eye(X_BE, X_CT), X_EC, atol=1e-9)
-    result = hand_eye.hand_eye(PAPER, BOARD.points(), [board_seen(X) for X in X_BE], X_BE)
-    np.testing.assert_allclose(result.X, X_EC, atol=1e-9)
-    np.testing.assert_allclose(result.X_target, X_BT, atol=1e-9)
-    assert result.position_mm.max() < 1e-6 and result.left_out_deg.max() < 1e-6
-
-
-def test_hand_eye_beside_the_robot_gives_the_camera_in_the_base():
-    # The board in the hand and the camera on the base: the same relation with base and hand exchanged.
-    X_BE = [frames.inverse(X) for X in hand_poses()]
-    corners = [board_seen(frames.inverse(X)) for X in X_BE]
-    result = hand_eye.hand_eye(PAPER, BOARD.points(), corners, X_BE, to_hand=True)
-    np.testing.assert_allclose(result.X, X_EC, atol=1e-9)
-
-
-def test_hand_eye_errors_are_those_it_states():
-    rng, off = np.random.default_rng(22), []
-    for _ in range(6):
-        X_BE = hand_poses(12)
-        noisy = [
-            frames.make(X[:, :3] @ frames.rotation(rng.normal(0, 1e-3, 3)), X[:, 3] + rng.normal(0, 3e-4, 3))
-            for X in X_BE
-        ]
-        result = hand_eye.hand_eye(PAPER, BOARD.points(), [board_seen(X, 0.2, rng) for X in X_BE], noisy)
-        off.append(1e3 * (result.X[:, 3] - X_EC[:, 3]) / result.sigma_mm)
-        assert (
-            0.1 < np.sqrt((result.position_mm**2).mean()) < 3 and result.left_out_mm.mean() > result.position_mm.mean()
-        )
-    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.8
-
-
-def test_a_hand_that_turned_about_one_axis_is_refused():
-    X_BE = hand_poses(two_axes=False)
-    with pytest.raises(ConfigError, match="one axis only"):
-        hand_eye.hand_eye(PAPER, BOARD.points(), [board_seen(X) for X in X_BE], X_BE)
-
 
 # ---------------------------------------------------------------- files
 

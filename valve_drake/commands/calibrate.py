@@ -45,7 +45,7 @@ def command(options: argparse.Namespace) -> int:
         from valve_drake.camera import hand_eye_report
 
         report = hand_eye_report.hand_eye(
-            options.images, options.poses, board, options.out, options.camera, options.eye_to_hand
+            options.images, options.poses, board, options.out, options.camera, options.eye_to_hand, options.html
         )
     else:
         distances = None if options.distances is None else _millimetres(options.distances)
@@ -53,7 +53,7 @@ def command(options: argparse.Namespace) -> int:
             report = reports.stereo(options.left, options.right, board, options.out, options.lens, distances)
         else:
             report = reports.intrinsics(options.images, board, options.out, options.lens, distances)
-    if options.html:
+    if options.html and options.kind != "hand-eye":
         try:
             options.html.write_text(report.page, encoding="utf-8")
         except OSError as error:
