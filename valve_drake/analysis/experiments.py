@@ -21,6 +21,7 @@ import numpy as np
 import yaml
 
 from valve_drake import frames, resources
+from valve_drake.analysis import hand_eye_experiment
 from valve_drake.analysis.drawn_images import GREEN, METAL, PLATE, RED, WALL, Canvas, draw_bar, draw_board
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import require, require_in
@@ -535,6 +536,7 @@ def _distractors(rng: np.random.Generator, X: np.ndarray | None, marker: Marker)
 # ---------------------------------------------------------------- all of them
 
 EXPERIMENTS: dict[str, Callable[..., dict[str, Any]]] = {
+    "hand-eye": hand_eye_experiment.hand_eye,
     "table2": table2,
     "table3": table3,
     "bound": bound,

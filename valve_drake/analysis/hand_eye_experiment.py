@@ -83,7 +83,9 @@ def scene(rng: np.random.Generator, n: int, to_hand: bool, turn: float, shift: f
     near, far = (0.5, 0.1) if to_hand else (0.06, 0.5)
     X = frames.make(frames.rotation(rng.normal(0, 1, 3)), rng.normal(0, near, 3))
     Y = frames.make(frames.rotation(rng.normal(0, 1, 3)), rng.normal(0, far, 3))
-    points, arm, corners = BOARD.points(), [], []
+    points = BOARD.points()
+    arm: list[np.ndarray] = []
+    corners: list[np.ndarray] = []
     while len(arm) < n:
         z = rng.uniform(*_DISTANCES)
         Z = frames.make(frames.rotation(rng.uniform(-_TILT, _TILT, 3)), np.array([*rng.uniform(-0.15, 0.15, 2) * z, z]))

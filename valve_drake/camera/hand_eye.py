@@ -19,6 +19,7 @@ import dataclasses as dc
 import itertools
 import math
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -27,6 +28,8 @@ from valve_drake import frames
 from valve_drake.camera.least_squares import divided, skew, stepped, transform
 from valve_drake.camera.lens import LensModel
 from valve_drake.checks import ConfigError
+
+Poses: TypeAlias = Sequence[np.ndarray] | np.ndarray  # (n, 3, 4)
 
 METHODS = {
     "Tsai": cv2.CALIB_HAND_EYE_TSAI,
@@ -293,9 +296,7 @@ def _corner_variances(V: np.ndarray) -> np.ndarray:
     return 1 / np.array([known[:3].mean(), known[3:].mean()])
 
 
-def closed_hand_eye(
-    carriers: Sequence[np.ndarray], boards: Sequence[np.ndarray], method: int = cv2.CALIB_HAND_EYE_PARK
-) -> np.ndarray:
+def closed_hand_eye(carriers: Poses, boards: Poses, method: int = cv2.CALIB_HAND_EYE_PARK) -> np.ndarray:
     """X (3, 4) from the poses of what carries the camera (X_BE, beside the robot X_EB) and the boards' X_CT.
 
     Raises ConfigError unless the hand turned about two axes: about one alone, the camera's place along it is free.
@@ -311,14 +312,14 @@ def closed_hand_eye(
     return published(carriers, boards, method)
 
 
-def turns(carriers: Sequence[np.ndarray]) -> np.ndarray:
+def turns(carriers: Poses) -> np.ndarray:
     """(3,) rms turn between two poses about the axes of the most, the second and the least turning [rad]."""
     w = [frames.rotation_vector(a[:, :3].T @ b[:, :3]) for a, b in itertools.combinations(carriers, 2)]
     out: np.ndarray = np.linalg.svd(np.array(w))[1] / math.sqrt(len(w))
     return out
 
 
-def published(carriers: Sequence[np.ndarray], boards: Sequence[np.ndarray], method: int) -> np.ndarray:
+def published(carriers: Poses, boards: Poses, method: int) -> np.ndarray:
     """X (3, 4) by one of OpenCV's METHODS. Raises ConfigError if it finds none."""
     R, t = cv2.calibrateHandEye(
         [X[:, :3] for X in carriers],

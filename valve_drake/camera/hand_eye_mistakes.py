@@ -6,6 +6,7 @@ millimetres, the neighbour's image, exchanged poses.
 """
 
 import dataclasses as dc
+import functools
 import math
 from collections.abc import Callable, Sequence
 
@@ -118,11 +119,11 @@ def _hypotheses(seen: Seen, poses: Poses) -> list[tuple[str, Seen | None]]:
         ("with the rotations transposed{}: X_BE holds the axes of E in its columns", _turned(seen, lambda R: R.T)),
     ]
     for text, order in (("wxyz read as xyzw", (3, 0, 1, 2)), ("xyzw read as wxyz", (1, 2, 3, 0))):
-        again = _turned(seen, lambda R, order=order: _reordered(R, order))
+        again = _turned(seen, functools.partial(_reordered, order=order))
         out.append((f"with the quaternions in the other order{{}} (they look like {text})", again))
-    for order in ("xyz", "zyx"):
-        again = _turned(seen, lambda R, order=order: _euler(R, order))
-        out.append((f"with the Euler angles applied in the other order{{}} (about {order}, fixed or moving)", again))
+    for axes in ("xyz", "zyx"):
+        again = _turned(seen, functools.partial(_euler, axes=axes))
+        out.append((f"with the Euler angles applied in the other order{{}} (about {axes}, fixed or moving)", again))
     place, n = np.array(poses.used), len(poses.X_BE)
     for shift in _SHIFTS:
         ok = (place + shift >= 0) & (place + shift < n)
@@ -176,10 +177,10 @@ def _reordered(R: np.ndarray, order: tuple[int, ...]) -> np.ndarray:
     return frames.rotation(q[1:] * (turn / norm) if norm > 0 else np.zeros(3))
 
 
-def _euler(R: np.ndarray, order: str) -> np.ndarray:
-    """R = A(a) B(b) C(c) about the axes of `order`, as C(c) B(b) A(a)."""
-    i, j, k = ("xyz".index(axis) for axis in order)
-    sign = 1.0 if order == "xyz" else -1.0
+def _euler(R: np.ndarray, axes: str) -> np.ndarray:
+    """R = A(a) B(b) C(c) about `axes`, as C(c) B(b) A(a)."""
+    i, j, k = ("xyz".index(axis) for axis in axes)
+    sign = 1.0 if axes == "xyz" else -1.0
     b = math.asin(float(np.clip(sign * R[i, k], -1, 1)))
     a = math.atan2(-sign * R[j, k], R[k, k])
     c = math.atan2(-sign * R[i, j], R[i, i])
