@@ -7,7 +7,7 @@ import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
 
 from valve_drake.behaviors import valve_search
-from valve_drake.behaviors.base_approach import BaseApproachConfig, Memory, Track, step
+from valve_drake.behaviors.base_approach import BaseApproachConfig, MedianPlace, Memory, step
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, inverse, make, rot_z, wrap
@@ -385,7 +385,7 @@ def test_retreat_waits_for_the_arms_but_not_for_ever():
 
 
 def test_a_track_takes_the_median_heading_across_half_a_turn():
-    track = Track()
+    track = MedianPlace()
     for k, turn in enumerate((-0.1, 0.0, 0.1, 0.02, 3.0)):
         track = track.add(k, np.array([0.0, 0, wrap(np.pi + turn)]), 5)
     assert abs(wrap(track.median[2] - np.pi)) < 0.03

@@ -8,12 +8,12 @@ import pytest
 from valve_drake import resources
 from valve_drake.behaviors.grasp_geometry import (
     StanceConfig,
+    angle_turned,
     best_arc,
     check_arc,
     find_stance,
     hand_in_valve,
     standoff,
-    turn_between,
     turned,
 )
 from valve_drake.behaviors.taught import load_taught
@@ -53,21 +53,21 @@ def test_positive_turns_counter_clockwise_as_seen_from_the_robot():
 
 
 @pytest.mark.parametrize("angle", [-3.0, -np.pi / 2, -0.01, 0.0, 0.4, 1.5, 3.1])
-def test_turn_between_measures_what_turned_turns(angle):
+def test_angle_turned_measures_what_turned_turns(angle):
     rng = np.random.default_rng(1)
     X = make(rotation(rng.normal(size=3)), rng.normal(size=3))
-    assert turn_between(X, turned(X, angle)) == pytest.approx(angle)
-    assert turn_between(turned(X, angle), X) == pytest.approx(-angle)
+    assert angle_turned(X, turned(X, angle)) == pytest.approx(angle)
+    assert angle_turned(turned(X, angle), X) == pytest.approx(-angle)
     assert np.array_equal(turned(X, angle)[:, 3], X[:, 3])
 
 
-def test_turn_between_is_not_moved_by_errors_of_the_axis():
+def test_angle_turned_is_not_moved_by_errors_of_the_axis():
     rng = np.random.default_rng(2)
     X = valve_at(1.0)
     for _ in range(50):
         w = rng.normal(size=3) * [0.1, 0.1, 0]
         seen = make(turned(X, 1.5)[:, :3] @ rotation(w), X[:, 3] + rng.normal(size=3) * 0.01)
-        assert turn_between(X, seen) == pytest.approx(1.5, abs=1e-9)
+        assert angle_turned(X, seen) == pytest.approx(1.5, abs=1e-9)
 
 
 # ---------------------------------------------------------------- the grasps

@@ -314,12 +314,12 @@ def test_a_stop_on_the_way_is_an_end_stop(stop, spin):
 
 def test_creep_is_no_progress_and_a_valve_that_sticks_again_and_again_is_stuck():
     law = Bench().law
-    memory = Memory(stage="turn", mark=(0.0, 0.3), turned=0.3)
+    memory = Memory(stage="turn", progress_at=(0.0, 0.3), turned=0.3)
     for k in range(300):
         memory = law._stall(k * TICK, dc.replace(memory, turned=0.3 + 2e-5 * k), 1.0, 1.0)
         assert (memory.stage == "back") == (k * TICK > CONFIG.stall_time)
     assert memory.stalls == 1 and memory.stalled_at == pytest.approx(0.305, abs=0.001)
-    often = Memory(stage="turn", mark=(0.0, 0.9), turned=0.9, stalls=3, stalled_at=0.6)
+    often = Memory(stage="turn", progress_at=(0.0, 0.9), turned=0.9, stalls=3, stalled_at=0.6)
     memory = law._stall(CONFIG.stall_time + TICK, often, 1.0, 1.0)
     assert memory.status.verdict == "stuck" and "4 times" in memory.status.detail
 
@@ -487,7 +487,7 @@ def test_release_bleeds_the_forces_before_it_opens(friction, after):
     opened, widths = [], []
 
     def watch(b):
-        if b.memory.stage == "back":
+        if b.memory.stage == "retreat":
             widths.append(min(b.gripper))
         if not opened and b.command.left_gripper[0] > 0:
             opened.append((b.time, b.load.copy(), b.X.copy()))

@@ -226,7 +226,7 @@ def test_a_hand_that_is_held_fast_is_not_pressed_on_for_ever():
     for side in SIDES:
         p = GEOMETRY.arm_forward(getattr(bench.commands[-1], f"{side}_arm"), side)[:, 3]
         gap = np.linalg.norm(p - bench.X(side)[:, 3])
-        assert gap < CONFIG.gain * bench.off(side) + CONFIG.sag + 0.001
+        assert gap < CONFIG.gain * bench.off(side) + CONFIG.max_droop + 0.001
 
 
 # ---------------------------------------------------------------- it says when it cannot

@@ -12,13 +12,13 @@ from robot_facts import ARMS_HOME as HOME
 from valve_drake import resources
 from valve_drake.behaviors.grasp_geometry import (
     StanceConfig,
+    angle_turned,
     find_stance,
     hand_in_valve,
     standoff,
-    turn_between,
     turned,
 )
-from valve_drake.behaviors.kinematic_approach import OTHERS, KinematicApproach, KinematicApproachConfig, Memory
+from valve_drake.behaviors.kinematic_approach import NOT_OWNED, KinematicApproach, KinematicApproachConfig, Memory
 from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
@@ -169,7 +169,7 @@ def test_home_mirrors_from_left_to_right(base):
     assert right == pytest.approx(left * [1, -1, 1])
 
 
-@pytest.mark.parametrize("mode", OTHERS)
+@pytest.mark.parametrize("mode", NOT_OWNED)
 def test_in_contact_and_at_the_end_the_arms_belong_to_others_and_the_next_motion_starts_where_they_are(base, mode):
     bench = Bench(base)
     bench.run(Mode.IDLE, limit=0.1)
@@ -417,8 +417,8 @@ def test_a_rectangle_that_looks_alike_after_part_of_a_turn_is_counted_by_the_han
 def test_the_way_home_keeps_clear_of_the_valve_as_the_hands_left_it(base):
     asked = []
     bench, _ = verify(base, 0.6, 0.58, 0.6, is_free=lambda X_BV, q: not asked.append(X_BV))
-    assert turn_between(bench.memory.plan.X_BV, asked[-1]) == pytest.approx(0.58)
-    assert turn_between(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.0)  # on the way there
+    assert angle_turned(bench.memory.plan.X_BV, asked[-1]) == pytest.approx(0.58)
+    assert angle_turned(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.0)  # on the way there
 
 
 @pytest.mark.parametrize("mode", [Mode.RETREAT, Mode.IDLE, Mode.SEARCH])
@@ -429,7 +429,7 @@ def test_an_early_retreat_or_a_reset_at_the_valve_keeps_clear_of_it_too(base, mo
     bench.run(Mode.STOPPED, limit=0.1)
     asked.clear()
     bench.run(mode, limit=0.1)
-    assert turn_between(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.4)
+    assert angle_turned(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.4)
     bench.run(Mode.STOPPED, limit=0.1)
     bench.base = bench.base - [1.5 * np.cos(bench.base[2]), 1.5 * np.sin(bench.base[2]), 0]  # away from it
     asked.clear()
@@ -490,7 +490,7 @@ def test_a_valve_that_turns_on_after_the_hands_let_go_is_not_turned(base):
     bench.turn, bench.X_OV = TurnState(angle=QUARTER), turned(X_OV, QUARTER)
     status = bench.run(Mode.VERIFY, limit=30.0, each=lambda b: turning(b, lambda t: -np.radians(0.3)))
     assert (status.state, status.verdict) == ("failed", "unverified")
-    assert status.value == pytest.approx(turn_between(X_OV, bench.X_OV), abs=0.005)
+    assert status.value == pytest.approx(angle_turned(X_OV, bench.X_OV), abs=0.005)
     assert re.search(r"turning by -0\.(29|3\d) deg/s", status.detail)
     assert "hands turned 90.00 deg of 90.00 deg" in status.detail
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
 
-from valve_drake.messages import REMEMBERED, SIDES
+from valve_drake.messages import POSE_HISTORY, SIDES
 from valve_drake.ports import SLOT, TICK
 from valve_drake.robot_state_system import HISTORY, RobotStateSystem
 from valve_drake.stations.contract import CONTRACT
@@ -56,7 +56,7 @@ def test_the_past_of_the_head_is_kept_for_a_second():
         state = dut.read("robot_state")
         assert state.time == k * TICK
         assert len(state.history) == min(k + 1, HISTORY)
-    assert HISTORY * TICK == pytest.approx(REMEMBERED)
+    assert HISTORY * TICK == pytest.approx(POSE_HISTORY)
     assert state.history[:, 0] == pytest.approx(np.arange(200 - HISTORY, 200) * TICK)
     base, torso = state.head_at(80 * TICK)
     assert base.tolist() == [80, 0, 0] and torso.tolist() == [80, 160, 240]

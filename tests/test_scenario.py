@@ -92,3 +92,13 @@ def test_loading_twice_shares_nothing():
     a.marker.size[0] = 0.05
     a.supervisor.deadline["search"] = 1.0
     assert b.marker.size[0] == 0.098 and b.supervisor.deadline["search"] == 60.0
+
+
+@pytest.mark.parametrize("old, new", mut.former_names().items())
+def test_a_key_that_was_renamed_is_refused_by_its_new_name_but_read_in_a_log(old, new):
+    with pytest.raises(ConfigError, match=f"{old} is now called {new}"):
+        mut.load(None, [f"{old}=1"])
+    (block, name), (_, former) = new.split("."), old.split(".")
+    assert len({block, name, former}) == 3
+    recorded = mut.parse(f"{block}: {{{former}: 0.0625}}", "a log", unknown=[])
+    assert getattr(getattr(recorded, block), name) == 0.0625

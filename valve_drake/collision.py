@@ -1,4 +1,4 @@
-"""Would the arms touch anything? The controllers' own model of robot, valve and panel, posed as they believe it."""
+"""Do the arms touch anything? A model of robot, valve and panel for planning, apart from the simulated plant."""
 
 import numpy as np
 from pydrake.geometry import QueryObject
@@ -11,13 +11,14 @@ from valve_drake.messages import SIDES
 from valve_drake.perception.marker import Marker
 from valve_drake.stations.scene import parse
 
-FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # where the valve is put when there is none
+FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the valve's pose while none is known
 
 
 class CollisionModel:
     """Robot at the base's origin with its waist at zero, and a valve that can be put anywhere.
 
-    clearance: least distance that counts as free [m].
+    clearance: least distance that counts as free; a larger one forbids poses near the valve [m].
+    opening: of both grippers [m].
     """
 
     def __init__(self, marker: Marker, clearance: float = 0.015, opening: float = 0.085):
@@ -37,7 +38,7 @@ class CollisionModel:
         self._opening = opening
 
     def _pose(self, X_BV: np.ndarray | None, q: np.ndarray) -> QueryObject:
-        """Poses this model (a copy of no plant that runs) and returns the query for it."""
+        """Poses the model and returns the geometry query for it."""
         plant, context = self._plant, self._context
         positions = np.array(plant.GetPositions(context))
         positions[self._arm] = q
@@ -51,7 +52,7 @@ class CollisionModel:
         return self._scene_graph.get_query_output_port().Eval(self._scene_graph.GetMyContextFromRoot(self._root))
 
     def is_free(self, X_BV: np.ndarray | None, q: np.ndarray) -> bool:
-        """True if nothing is nearer than the clearance. X_BV: the marker in the base, None without a valve; q (12,)."""
+        """True if no two bodies are nearer than the clearance. X_BV: marker in the base, None: no valve; q (12,)."""
         return len(self._pose(X_BV, q).ComputeSignedDistancePairwiseClosestPoints(self._clearance)) == 0
 
     def touching(self, X_BV: np.ndarray | None, q: np.ndarray) -> list[str]:

@@ -100,6 +100,7 @@ class Config:
     """Base of all groups of keys. KEY: where such a group stands in a scenario."""
 
     KEY: ClassVar[str] = ""
+    FORMER: ClassVar[Mapping[str, str]] = {}  # keys by the names that they had: refused in a scenario, read in a log
 
     def check(self, key: str | None = None) -> None:
         """Raises ConfigError that names the key, the rule and the value. key: of this group (default: KEY)."""
@@ -194,6 +195,11 @@ def _build(given: Any, kind: Any, default: Any, key: str, source: str, unknown: 
         values = {name: copy.deepcopy(getattr(default, name)) for name in fields}
         for name, item in _group(given, key, source).items():
             inner = f"{key}.{name}" if key else name
+            former = getattr(kind, "FORMER", {})
+            if name in former:
+                if unknown is None:
+                    raise ConfigError(f"{source}: {inner} is now called {kind.KEY}.{former[name]}")
+                name = former[name]  # a log keeps the name that the key had
             if name in fields:
                 values[name] = _build(item, fields[name].type, values[name], inner, source, unknown)
             elif unknown is None:

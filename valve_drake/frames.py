@@ -8,7 +8,7 @@ R_AB rotation, V_AB = [w; v], F = [torque; force].
     B  base: on the floor under the waist axis, x forward, y left, z up
     H  chest (reference of Table 5): turns with the waist, axes as B at zero, at the shoulders' mid-point
     L, R  head cameras: x right, y down, z forward; pixel (0, 0) is the centre of the first pixel (OpenCV)
-    A, D  left and right wrist cameras (their lens and mounting are known to nobody)
+    A, D  left and right wrist cameras (not calibrated: no code may use their lens or mounting)
     V  marker: origin at the rectangle's centre, x along the handles, z into the panel
     G, K  left and right hand, at the grip point: z approach, y closing direction, x = y cross z (along the bar)
     S, T  left and right wrist sensor: axes as the hand's, behind the grip point by GRIP_BEHIND
@@ -29,7 +29,7 @@ def rotation_vector(R: np.ndarray) -> np.ndarray:
         return w * (np.arctan2(s, c) / s)
     if c > 0:
         return w
-    k = int(np.argmax(np.diag(R)))  # half a turn: the axis is the dominant column of R + I
+    k = int(np.argmax(np.diag(R)))  # half a turn: the axis is the longest column of R + I
     axis = (R + np.eye(3))[:, k]
     return axis * (np.pi / np.linalg.norm(axis))
 
@@ -50,7 +50,7 @@ def rotation(w: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b of two (3,) vectors; ten times as fast as np.cross, which counts at 128 Hz."""
+    """a x b of two (3,) vectors; ten times as fast as np.cross, and called many times in every tick."""
     ax, ay, az = a
     bx, by, bz = b
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

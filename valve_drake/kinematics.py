@@ -1,4 +1,4 @@
-"""The robot's geometry as controllers know it: forward and inverse kinematics of arms and head, in closed form.
+"""Forward and inverse kinematics of arms and head in closed form, and the robot's dimensions.
 
 Arm (both sides alike, lateral offset mirrored; at zero it points straight forward):
 
@@ -28,7 +28,7 @@ R_G0 = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # R_HG at zero: x_G = y_H,
 
 @dc.dataclass(frozen=True)
 class RobotGeometry:
-    """Lengths [m] and the hand's load on its wrist sensor."""
+    """Dimensions [m], and the mass that each wrist sensor carries."""
 
     shoulder_half_width: float = 0.20
     shoulder_height: float = 1.05  # of H over the floor
@@ -130,7 +130,9 @@ class RobotGeometry:
             q = np.array([q1, q2, q3, q4, q5, q6])
             for k in (3, 5):
                 q[k] += 2 * np.pi * np.round((near[k] - q[k]) / (2 * np.pi))
-            q = np.where(np.abs(q) > ARM_LIMITS, q - np.sign(q) * 2 * np.pi, q)  # the other way round, if that fits
+            q = np.where(
+                np.abs(q) > ARM_LIMITS, q - np.sign(q) * 2 * np.pi, q
+            )  # by a whole turn, where that is within the limits
             if np.any(np.abs(q) > ARM_LIMITS):
                 continue
             c = np.sum(np.abs(q - near)[3:]) if q_near is not None else abs(q5 - lateral(side) * 1.3)
@@ -139,7 +141,7 @@ class RobotGeometry:
         return best
 
     def arm_margin(self, q: np.ndarray) -> float:
-        """How far an arm pose is from trouble: 1 is comfortable, 0 is at a limit.
+        """Distance of an arm pose from singularities and joint limits: 1 is comfortable, 0 at a limit, negative beyond.
 
         Elbow bend within 20..150 deg, wrist bend J5 within 12..118 deg, joints inside their limits.
         """

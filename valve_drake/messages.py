@@ -1,7 +1,7 @@
-"""What travels on the ports between blocks: frozen messages of numpy arrays, no pydrake.
+"""The messages on the ports between blocks: frozen dataclasses of numpy arrays, no pydrake.
 
-A message is never changed after it is made: its arrays are read-only copies and copying it returns
-itself, so that Drake's state copies cost nothing and a reader may keep what it has read.
+A message is immutable: its arrays are read-only and copying it returns itself, so that Drake's copies of a state cost
+nothing and a reader may keep the message.
 Times are seconds of the station's clock. Frames and units: frames.py.
 """
 
@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-REMEMBERED = 1.0  # where the head and the hands were is known for so long: no older image can be placed [s]
+POSE_HISTORY = 1.0  # length of the buffers of head and hand poses; older images are rejected [s]
 LEFT, RIGHT = "left", "right"
 SIDES = (LEFT, RIGHT)
 CAMERAS = ("head_left", "head_right", "left_wrist", "right_wrist")
@@ -42,9 +42,9 @@ class Message:
             if value is None and optional:
                 continue
             frozen = type(value) is np.ndarray and value.base is None and not value.flags.writeable
-            if not (frozen and value.dtype == np.float64):  # one that nobody can change is shared
+            if not (frozen and value.dtype == np.float64):  # immutable arrays are shared, not copied
                 value = np.array(value, dtype=np.float64)
-            if value.shape != shape:  # else it is a fixed one, and right
+            if value.shape != shape:  # an array of the field's own fixed shape needs no check
                 if value.size == 0 and -1 in shape:
                     value = value.reshape([0 if n < 0 else n for n in shape])
                 if value.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, value.shape)):
@@ -55,7 +55,7 @@ class Message:
     def __copy__(self) -> Self:
         return self
 
-    def __deepcopy__(self, memo: dict) -> Self:
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
 
 
@@ -257,7 +257,7 @@ class HandleMarks(Message):
 
 
 class Mode(enum.StrEnum):
-    """What the robot is doing. The supervisor alone changes it."""
+    """What the robot is doing. Only the supervisor changes it."""
 
     IDLE = "idle"
     SEARCH = "search"
@@ -296,7 +296,7 @@ class Verdict(enum.StrEnum):
 
 @dc.dataclass(frozen=True, eq=False)
 class OperatorCommand(Message):
-    """What a person asks for; a new `sequence` makes it a new request. angle > 0 [rad]."""
+    """An operator's request; a new `sequence` makes it a new one. angle > 0 [rad]."""
 
     sequence: int = -1
     command: str = ""  # open | close | stop | reset
@@ -305,8 +305,8 @@ class OperatorCommand(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class ModeState(Message):
-    """The supervisor's word to all blocks. `activation` counts entries into a mode: a behaviour
-    that sees a new one starts afresh, and its Status carries the number back."""
+    """The mode, for all blocks. `activation` counts entries into a mode: a behaviour that reads a new number starts
+    afresh, and its Status carries the number back."""
 
     time: float = 0.0
     mode: str = Mode.IDLE.value
@@ -320,7 +320,7 @@ class ModeState(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class Status(Message):
-    """What a behaviour says of its present activation."""
+    """The state of a behaviour in its present activation."""
 
     time: float = 0.0
     activation: int = -1
@@ -328,12 +328,12 @@ class Status(Message):
     verdict: str = Verdict.NONE.value  # why it failed
     detail: str = ""  # one line for people
     progress: float = 0.0  # 0..1
-    value: float = 0.0  # what the behaviour is about: the turned angle in turn and verify [rad]
+    value: float = 0.0  # the turned angle, in turn and verify [rad]
 
 
 @dc.dataclass(frozen=True, eq=False)
 class Command(Message):
-    """What a behaviour wants of the robot. None: this behaviour does not ask for that group."""
+    """What a behaviour commands the robot to do. None: it commands nothing to that group."""
 
     time: float = 0.0
     base_twist: np.ndarray | None = array(2, optional=True)  # forward [m/s], yaw rate [rad/s]
@@ -346,7 +346,7 @@ class Command(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class GraspPlan(Message):
-    """What kinematic_approach measured at rest and means to do: the valve in the base, and the grasps.
+    """What kinematic_approach measured at rest and plans: the valve in the base, and the grasps.
 
     A hand's pose in V is constant while the valve turns, since V turns with it. `swapped`: the left hand
     takes the handle at +x of V instead of -x.

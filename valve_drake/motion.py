@@ -1,9 +1,13 @@
-"""Bounded motion in discrete time: the few laws that every writer of a command shares. Arrays work elementwise."""
+"""Bounded motion in discrete time: the laws that all blocks with a commanded motion share, element by element."""
+
+from typing import TypeVar
 
 import numpy as np
 
+Numbers = TypeVar("Numbers", float, np.ndarray)  # a number, or an array of them
 
-def braking_speed(distance: np.ndarray | float, acceleration: np.ndarray | float, dt: float) -> np.ndarray | float:
+
+def braking_speed(distance: Numbers, acceleration: np.ndarray | float, dt: float) -> Numbers:
     """The highest speed that still stops within `distance` >= 0 when it falls by acceleration * dt each step.
 
     Exact for steps of dt: n of them cover d = n v dt - n (n - 1) / 2 a dt^2, with the fewest n that end at rest.
@@ -13,7 +17,7 @@ def braking_speed(distance: np.ndarray | float, acceleration: np.ndarray | float
     return distance / (n * dt) + unit * (n - 1) / 2
 
 
-def slew(value: np.ndarray | float, goal: np.ndarray | float, step: np.ndarray | float) -> np.ndarray | float:
+def slew(value: Numbers, goal: Numbers, step: np.ndarray | float) -> Numbers:
     """`value` moved towards `goal` by at most `step`."""
     return value + np.clip(goal - value, -step, step)
 

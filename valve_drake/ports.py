@@ -155,11 +155,11 @@ def _kind(hint: Any) -> Kind:
     return hint
 
 
-I = TypeVar("I", bound=Inputs)  # noqa: E741 (inputs)
+In = TypeVar("In", bound=Inputs)
 M = TypeVar("M")  # memory
 
 
-class Block(LeafSystem, Generic[I, M]):
+class Block(LeafSystem, Generic[In, M]):
     """A stage on ports. A subclass names its Inputs and its memory's type, sets OUTPUTS and writes `step`.
 
     OUTPUTS: port name -> message class, or vector size. INPUTS: ports beside the annotated ones, for names that come
@@ -211,11 +211,11 @@ class Block(LeafSystem, Generic[I, M]):
         """The memory before the first step; its arrays are locked. A block that keeps none need not write it."""
         return None  # type: ignore[return-value]
 
-    def step(self, time: float, inputs: I, memory: M) -> tuple[M, Outputs]:
+    def step(self, time: float, inputs: In, memory: M) -> tuple[M, Outputs]:
         """One step: new memory, and the outputs that change (those left out keep their value)."""
         raise NotImplementedError(f"{type(self).__name__}.step")  # abstract
 
-    def later(self, time: float, inputs: I, memory: M) -> tuple[M, Outputs]:
+    def later(self, time: float, inputs: In, memory: M) -> tuple[M, Outputs]:
         """A second step in slot 3, for slow work that no command of this tick needs; runs only where it is written."""
         return memory, {}
 

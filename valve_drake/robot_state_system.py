@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from valve_drake.messages import REMEMBERED, SIDES, RobotState
+from valve_drake.messages import POSE_HISTORY, SIDES, RobotState
 from valve_drake.ports import TICK, Block, Inputs, Outputs
 
-HISTORY = round(REMEMBERED / TICK)  # samples of the head's motion that are kept
+HISTORY = round(POSE_HISTORY / TICK)  # samples of the head's motion that are kept
 
 
 class RobotStateSystem(Block[Inputs, np.ndarray]):

@@ -38,7 +38,17 @@ from valve_drake.recording.recorder_system import RecorderSystem, Sink, Tee
 from valve_drake.recording.robot_frames import RobotFrames, pinholes
 from valve_drake.recording.signals import signals
 from valve_drake.recording.writer import LogError, LogWriter
-from valve_drake.scenario import RETIRED, TAGS, Scenario, dump, parse, resolve, split_override, with_overrides
+from valve_drake.scenario import (
+    RETIRED,
+    TAGS,
+    Scenario,
+    dump,
+    former_names,
+    parse,
+    resolve,
+    split_override,
+    with_overrides,
+)
 from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.hardware import AHEAD, RobotLink
@@ -470,7 +480,9 @@ def _recorded_scenario(log: LogReader) -> tuple[Scenario, list[str]]:
     for key in unknown:
         if key not in RETIRED:
             raise ConfigError(f"{log.path} cannot be replayed: its scenario has the unknown key {key}")
-    missing = sorted(key_names(config.tree(scenario)) - key_names(yaml_file.parse(text, str(log.path), TAGS)))
+    former = former_names()
+    present = {former.get(key, key) for key in key_names(yaml_file.parse(text, str(log.path), TAGS))}
+    missing = sorted(key_names(config.tree(scenario)) - present)
     notes = []
     if missing:
         notes.append(f"the log's scenario lacks keys of this program, their defaults stand in: {', '.join(missing)}")

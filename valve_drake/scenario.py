@@ -113,6 +113,12 @@ class Scenario(Config):
             require(low <= value <= high, f"valve_search.{name}", words, value)
 
 
+def former_names() -> dict[str, str]:
+    """Keys that were renamed: the old key of a log's scenario -> the key of today."""
+    kinds = [type(value) for value in vars(Scenario()).values() if isinstance(value, Config)]
+    return {f"{kind.KEY}.{old}": f"{kind.KEY}.{new}" for kind in kinds for old, new in kind.FORMER.items()}
+
+
 def load(path: str | None = None, overrides: typing.Sequence[str] = ()) -> Scenario:
     """The scenario of a file (a path, or a name in diagrams/; None: the default one) with `key=value` overrides.
 

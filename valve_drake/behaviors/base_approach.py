@@ -1,22 +1,22 @@
-"""Stages 1 and 2 on wheels: a differential drive brought to the stance before the valve, and away from it again.
+"""Stages 1 and 2 on wheels: drives the base (a differential drive) to the stance before the valve, and away again.
 
     rough_approach  turns towards the marker's position of stage 1 and drives until it is nearer than 2 m.
     fine_approach   by the pose of stage 2, to the stance that kinematic_approach asks for:
-                        turn    to face (or to have behind) the pre-stance, a point straight behind the stance
+                        turn    to point the front or the back to the pre-stance, a point straight behind the stance
                         drive   to it, forwards or backwards, whichever keeps the marker better in view
                         align   to the stance's heading
                         line    straight in, steering onto the line through the stance
                         settle  trim heading and distance, stand still, check
-                    A differential drive cannot step sideways: if it ends beside the stance, it goes through all this
-                    again, which is to back off and come in once more.
+                    A differential drive cannot step sideways: if it ends beside the stance, it backs off and goes
+                    through all phases again.
     retreat         straight back, once the arms are still.
 
-The panel is kept clear: the base's centre never comes nearer to the panel's plane than `clearance`. A stance nearer
-than that is refused; from an allowed start all ways are straight lines between allowed points, and none can cut into
-the half-plane behind the clearance. A start nearer than that only moves away: the pre-stance lies further out.
+The base's centre never comes nearer to the panel's plane than `clearance`. A stance nearer than that is refused; from
+an allowed start the base drives straight lines between allowed points, so no line can cross the clearance. From a
+start nearer than that the base only moves away: the pre-stance is farther out.
 
 In the stance's frame: s along its heading, e to its left, psi the heading against it.
-Line law: psi_ref = -atan(e / look).
+Line law: psi_ref = -atan(e / look_ahead).
 Frames: frames.py; everything here is on the floor, in O.
 """
 
@@ -49,42 +49,45 @@ class BaseApproachConfig(Config):
     """Scenario key `base_approach`."""
 
     KEY = "base_approach"
-    speed: float = number(0.7, 0.05, 1.5, "in the rough approach [m/s]")
-    fine_speed: float = number(0.5, 0.02, 1.5, "to the pre-stance [m/s]")
-    line_speed: float = number(0.3, 0.02, 1.0, "straight in along the line to the stance [m/s]")
-    reverse_speed: float = number(0.3, 0.02, 1.0, "backwards [m/s]")
+    FORMER = {"closing": "approach_gain", "look": "look_ahead"}
+    speed: float = number(0.7, 0.05, 1.5, "in the rough approach, at most [m/s]")
+    fine_speed: float = number(0.5, 0.02, 1.5, "to the pre-stance, at most [m/s]")
+    line_speed: float = number(0.3, 0.02, 1.0, "from the pre-stance to the stance, at most [m/s]")
+    reverse_speed: float = number(0.3, 0.02, 1.0, "backwards to the pre-stance, at most [m/s]")
     trim_speed: float = number(0.05, 0.005, 0.3, "at the stance, at most [m/s]")
-    yaw_rate: float = number(1.0, 0.05, 2.0, "[rad/s]")
+    yaw_rate: float = number(1.0, 0.05, 2.0, "at most [rad/s]")
     acceleration: float = number(0.7, 0.05, 1.5, "of the command [m/s^2]")
     yaw_acceleration: float = number(1.5, 0.1, 4.0, "[rad/s^2]")
-    braking: float = number(
-        0.6, 0.1, 1.0, "share of the accelerations that braking counts on; lower it if the base overshoots"
+    braking: float = number(0.6, 0.1, 1.0, "share of the accelerations used to brake; lower it if the base overshoots")
+    steering: float = number(
+        3.0, 0.2, 10.0, "yaw rate <= steering * heading error; lower it if the heading oscillates [1/s]"
     )
-    steering: float = number(3.0, 0.2, 10.0, "yaw rate per heading error, at most [1/s]")
-    closing: float = number(2.5, 0.2, 10.0, "speed per distance to go, at most; lower it if the base overshoots [1/s]")
+    approach_gain: float = number(
+        2.5, 0.2, 10.0, "speed <= gain * distance to go; lower it if the base overshoots [1/s]"
+    )
     rough_distance: float = number(2.0, 1.2, 6.0, "the rough approach ends nearer to the marker than this [m]")
-    rough_stop: float = number(1.85, 1.2, 6.0, "and comes to rest here; it never drives nearer [m]")
-    facing: float = number(0.4, 0.05, 1.5, "turns on the spot beyond this bearing, before it drives [rad]")
-    sightings: int = number(5, 1, 50, "it steers by the median of so many")
+    rough_stop: float = number(1.85, 1.2, 6.0, "where it comes to rest; it never drives nearer [m]")
+    facing: float = number(0.4, 0.05, 1.5, "with a larger bearing it turns on the spot before it drives [rad]")
+    sightings: int = number(5, 1, 50, "it steers by the median of this many; raise it against wild estimates")
     odometry_check: float = number(0.6, 0.1, 3.0, "driven so far, odometry is held against the cameras [m]")
     odometry_error: float = number(
         0.35, 0.05, 0.5, "share of what was driven: more is a fault; raise it for wheels that slip"
     )
-    pre_stance: float = number(0.6, 0.1, 2.0, "behind the stance [m]")
-    look: float = number(0.22, 0.05, 2.0, "look-ahead of the line law; raise it if the base swings [m]")
+    pre_stance: float = number(0.6, 0.1, 2.0, "distance of the pre-stance behind the stance [m]")
+    look_ahead: float = number(0.22, 0.05, 2.0, "of the line law; raise it if the base swings about the line [m]")
     clearance: float = number(0.62, 0.55, 1.5, "base centre to panel plane, at least [m]")
-    position_tolerance: float = number(0.015, 0.002, 0.1, "at the stance [m]")
-    heading_tolerance: float = number(0.0175, 0.002, 0.2, "at the stance [rad]")
-    still_time: float = number(0.3, 0.05, 5.0, "the base stands still for so long before it has arrived [s]")
-    still_speed: float = number(0.01, 0.001, 0.05, "measured, slower is still [m/s]")
-    still_rate: float = number(0.02, 0.002, 0.1, "measured, slower is still [rad/s]")
-    attempts: int = number(4, 1, 20, "at coming in straight")
-    stance_patience: float = number(5.0, 0.5, 60.0, "it waits so long for a first stance [s]")
-    retreat_distance: float = number(0.5, 0.05, 2.0, "straight back [m]")
+    position_tolerance: float = number(0.015, 0.002, 0.1, "of the base at the stance [m]")
+    heading_tolerance: float = number(0.0175, 0.002, 0.2, "of the base at the stance [rad]")
+    still_time: float = number(0.3, 0.05, 5.0, "at rest for so long, the stance is reached [s]")
+    still_speed: float = number(0.01, 0.001, 0.05, "a base that is measured slower is at rest [m/s]")
+    still_rate: float = number(0.02, 0.002, 0.1, "a base that turns slower is at rest [rad/s]")
+    attempts: int = number(4, 1, 20, "at driving in straight, before it fails")
+    stance_patience: float = number(5.0, 0.5, 60.0, "waits so long for a first stance [s]")
+    retreat_distance: float = number(0.5, 0.05, 2.0, "straight back from the stance [m]")
     retreat_speed: float = number(0.2, 0.02, 0.5, "[m/s]")
-    arms_still: float = number(0.05, 0.005, 0.5, "joint speed below which the arms are still [rad/s]")
-    arms_wait: float = number(0.5, 0.05, 10.0, "they are still for so long before the base retreats [s]")
-    arms_patience: float = number(6.0, 0.5, 60.0, "and it retreats anyway after this [s]")
+    arms_still: float = number(0.05, 0.005, 0.5, "arms with slower joints are at rest [rad/s]")
+    arms_wait: float = number(0.5, 0.05, 10.0, "it retreats when the arms have been at rest for so long [s]")
+    arms_patience: float = number(6.0, 0.5, 60.0, "it retreats after this in any case [s]")
 
     def relations(self, key: str) -> None:
         below = self.rough_stop < self.rough_distance
@@ -92,18 +95,18 @@ class BaseApproachConfig(Config):
 
 
 @dc.dataclass(frozen=True, eq=False)
-class Track:
+class MedianPlace:
     """The median of the last few places (x, y, heading) on the floor: one wild estimate does not move it."""
 
-    seen: float = -np.inf  # time of the newest, or since when they count [s]
+    seen: float = -np.inf  # capture time of the newest; older ones do not count [s]
     places: tuple[np.ndarray, ...] = ()
-    median: np.ndarray | None = None
+    median: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # means nothing while there are no places
 
-    def add(self, time: float, place: np.ndarray, count: int) -> "Track":
+    def add(self, time: float, place: np.ndarray, count: int) -> "MedianPlace":
         places = (*self.places, place)[-count:]
         rows = np.array(places)
         rows[:, 2] = [place[2] + wrap(h - place[2]) for h in rows[:, 2]]
-        return Track(time, places, np.median(rows, axis=0))
+        return MedianPlace(time, places, np.median(rows, axis=0))
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -118,14 +121,14 @@ class Memory:
     progress: float = 0.0
     twist: np.ndarray = dc.field(default_factory=lambda: np.zeros(2))  # command [m/s, rad/s]
     start: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # base at the activation [m, m, rad]
-    marker: Track = Track()  # stage 1: heading means nothing
+    marker: MedianPlace = MedianPlace()  # stage 1: heading means nothing
     first_seen: np.ndarray | None = None  # marker's x, y when it was sure first, and the base's then [m]
-    panel: Track = Track()  # a point of its plane, and the heading of the normal into it
-    stance: Track = Track()
+    panel: MedianPlace = MedianPlace()  # a point of its plane, and the heading of the normal into it
+    stance: MedianPlace = MedianPlace()
     phase: str = "plan"
     direction: float = 1.0  # of driving to the pre-stance: 1 forwards, -1 backwards
     attempt: int = 0
-    quiet_since: float = 0.0  # the base or the arms are still since [s]
+    quiet_since: float = 0.0  # since when the base or the arms are at rest [s]
 
 
 def step(
@@ -147,7 +150,7 @@ def step(
     m = memory
     if mode.activation != m.activation:
         # The twist goes on from where it is, so that two approaches in a row join smoothly.
-        fresh = Track(seen=time)
+        fresh = MedianPlace(seen=time)
         m = Memory(mode.activation, time, twist=m.twist, start=base, quiet_since=time)
         m = dc.replace(m, marker=fresh, panel=fresh, stance=fresh)
     goal = np.zeros(2)
@@ -173,7 +176,7 @@ def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") 
 
 def _drive(config: BaseApproachConfig, gap: float, speed: float, dt: float) -> float:
     """Forward speed that stops after `gap` [m]."""
-    return towards(gap, min(speed, config.closing * abs(gap)), config.braking * config.acceleration, dt)
+    return towards(gap, min(speed, config.approach_gain * abs(gap)), config.braking * config.acceleration, dt)
 
 
 def _turn(config: BaseApproachConfig, angle: float, dt: float) -> float:
@@ -186,8 +189,8 @@ def _still(config: BaseApproachConfig, state: RobotState) -> bool:
     return abs(state.odometry[3]) < config.still_speed and abs(state.odometry[4]) < config.still_rate
 
 
-def _sure(config: BaseApproachConfig, track: Track) -> bool:
-    """A first glance can be wrong, so it takes a few."""
+def _sure(config: BaseApproachConfig, track: MedianPlace) -> bool:
+    """Whether there are enough places: a single estimate can be wrong."""
     return len(track.places) >= min(3, config.sightings)
 
 
@@ -200,7 +203,7 @@ def _rough(
     if position.found and position.time > m.marker.seen:
         p_OV = apply(position.X_OL, position.p_LV)
         m = dc.replace(m, marker=m.marker.add(position.time, np.array([p_OV[0], p_OV[1], 0.0]), config.sightings))
-    if m.marker.median is None:
+    if not m.marker.places:
         return m, np.zeros(2)
     x, y, heading = state.odometry[:3]
     p = m.marker.median
@@ -384,7 +387,7 @@ def _line_phase(
 ) -> tuple[Memory, np.ndarray]:
     if at.s > -0.005:
         return dc.replace(m, phase="settle"), np.zeros(2)
-    psi_ref = float(-np.arctan(at.e / config.look))
+    psi_ref = float(-np.arctan(at.e / config.look_ahead))
     rate = float(np.clip(config.steering * wrap(psi_ref - at.psi), -config.yaw_rate, config.yaw_rate))
     return m, np.array([_drive(config, -at.s, config.line_speed, dt), rate])
 
@@ -395,7 +398,7 @@ PHASES = {"turn": _turn_phase, "drive": _drive_phase, "align": _align_phase, "li
 def _settle(
     config: BaseApproachConfig, m: Memory, time: float, dt: float, state: RobotState, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
-    """Trims heading and distance; then stillness decides."""
+    """Trims heading and distance; succeeds when the base has been at rest within the tolerances."""
     turn = abs(at.psi) > config.heading_tolerance / 3
     shift = abs(at.s) > config.position_tolerance / 3
     busy = turn or (shift and abs(at.e) < config.position_tolerance)

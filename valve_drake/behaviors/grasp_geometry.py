@@ -1,4 +1,4 @@
-"""Where the hands hold the valve, for any angle of it; and the stance from which they can.
+"""Where the hands hold the valve, at any angle of it; and the stance: where the base stands so that they can.
 
 With both hands on the handles, a hand's pose X_VG in the marker's frame does not change while the valve
 turns, since V turns with it. Turning by theta (positive opens, about -z of V): X_OV(theta) = X_OV R_z(-theta).
@@ -23,16 +23,18 @@ class StanceConfig(Config):
     """Scenario key `stance`: which places to stand at are tried."""
 
     KEY = "stance"
-    distance_min: float = number(0.70, 0.5, 1.2, "shoulder axis to the panel's axis point, along the floor [m]")
-    distance_max: float = number(0.84, 0.5, 1.2, "the farthest that is tried [m]")
+    distance_min: float = number(
+        0.70, 0.5, 1.2, "least distance that is tried, shoulder axis to the panel along the floor [m]"
+    )
+    distance_max: float = number(0.84, 0.5, 1.2, "largest distance that is tried [m]")
     distance_step: float = number(0.02, 0.005, 0.2, "between two distances; halving it doubles the search [m]")
     standoff: float = number(
-        0.12, 0.02, 0.3, "hands start and end this far from the grasp, against the wrist camera's view [m]"
+        0.12, 0.02, 0.3, "hands start and end this far from the grasp, along the wrist camera's view [m]"
     )
     arc_step: float = number(
-        0.27, 0.1, 1.0, "between two poses of the turn that are tried; halving it doubles the search [rad]"
+        0.27, 0.1, 1.0, "between two angles of the turn that are checked; halving it doubles the search [rad]"
     )
-    margin_enough: float = number(0.9, 0.01, 1.0, "an arm margin with which the search for a better stance ends")
+    margin_enough: float = number(0.9, 0.01, 1.0, "the search ends at the first stance with this arm margin")
     margin_min: float = number(0.15, 0.01, 1.0, "least arm margin that is accepted (1 is comfortable)")
 
     def relations(self, key: str) -> None:
@@ -48,7 +50,7 @@ def turned(X_AV: np.ndarray, angle: float) -> np.ndarray:
     return compose(X_AV, make(rot_z(-angle), np.zeros(3)))
 
 
-def turn_between(X_AV0: np.ndarray, X_AV1: np.ndarray) -> float:
+def angle_turned(X_AV0: np.ndarray, X_AV1: np.ndarray) -> float:
     """The angle turned from pose 0 to pose 1 about the common axis, in (-pi, pi], positive opens."""
     R = X_AV0[:, :3].T @ X_AV1[:, :3]
     return float(-np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
@@ -86,14 +88,15 @@ def check_arc(
     config: StanceConfig,
     view: dict[str, np.ndarray],
 ) -> ArcCheck:
-    """Can both hands hold their handles all along the turn, and draw back from them at both ends?
+    """Whether both hands can hold their handles all along the turn, and draw back from them at both ends.
 
     X_BV: marker in the base, waist at zero. view: each wrist camera's view direction in its hand's frame.
     """
     X_HV = compose(inverse(geometry.X_BH()), X_BV)
     count = max(2, int(np.ceil(abs(turn_angle) / config.arc_step)) + 1)
     angles = np.linspace(0.0, turn_angle, count)
-    margin, first = 1.0, {}
+    margin = 1.0
+    first: dict[str, np.ndarray] = {}
     for side in SIDES:
         X_VG = hand_in_valve(side, swapped, marker)
         q_last = None
@@ -123,7 +126,7 @@ def best_arc(
     config: StanceConfig,
     view: dict[str, np.ndarray],
 ) -> ArcCheck:
-    """The better of the two ways to share the handles between the hands."""
+    """The better of the two assignments of the handles to the hands, by its margin."""
     arcs = [check_arc(X_BV, turn_angle, swapped, geometry, marker, config, view) for swapped in (False, True)]
     return max(arcs, key=lambda arc: arc.margin)
 
@@ -139,7 +142,7 @@ def find_stance(
     """The nearest base pose (x, y, heading) in O, square to the panel, with a comfortable arm margin over the whole
     turn; if there is none, the one with the largest margin.
 
-    Returns (base (3,), margin); margin < 0 where no stance serves.
+    Returns (base (3,), margin); margin < 0 if there is no stance from which the hands reach.
     """
     heading = float(np.arctan2(X_OV[1, 2], X_OV[0, 2]))  # of z_V, into the panel, on the floor
     forward = np.array([np.cos(heading), np.sin(heading)])

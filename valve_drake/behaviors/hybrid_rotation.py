@@ -11,16 +11,17 @@ hands' twists are split into common and relative parts [Uchiyama, Dauchez 1988]:
     h_r* = squeeze b - (tau / L) t                                                                     (5)
 
 hand 1 left, 2 right; b from hand 1 to 2, t = u x b, L their distance, tau the couple on the valve. D_a = 2 D and
-D_r = D / 2 give each hand the same damping D. The term of (5) in tau is not optional: the two driving forces are
-themselves a relative wrench, and a constant h_r* would make the hands yield to the couple that they should apply.
+D_r = D / 2 give each hand the same damping D. The term of (5) in tau is necessary: the two driving forces are
+themselves a relative wrench, and with a constant h_r* the hands yield to the couple that they should apply.
 
-There is no integrator on the turn: the rate is scaled down as the torque nears its limit, and beyond it the turn
-yields as all other directions do, so a stuck valve never winds up energy. The joints get positions only; feeding the
+There is no integrator on the turn: the rate is scaled down as the torque nears its limit, and beyond the limit the
+turn yields as all other directions do, so a stuck valve stores no energy. The joints get positions only: feeding the
 admittance's velocity forward makes the loop oscillate.
 
 All vectors are in the chest frame H, which stands still while the hands are on the valve.
 """
 
+import copy
 import dataclasses as dc
 
 import numpy as np
@@ -32,6 +33,7 @@ from valve_drake.frames import cross, make, rotation, wrap
 from valve_drake.kinematics import RobotGeometry
 from valve_drake.messages import (
     LEFT,
+    RIGHT,
     SIDES,
     Command,
     GraspPlan,
@@ -45,7 +47,7 @@ from valve_drake.messages import (
 from valve_drake.perception.marker import Marker
 
 GRAVITY = 9.81
-AT_VALVE = (Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE)  # the wrists are listened to
+AT_VALVE = (Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE)  # the wrist sensors are tared or filtered
 
 
 @dc.dataclass
@@ -54,35 +56,44 @@ class HybridRotationConfig(Config):
 
     KEY = "hybrid_rotation"
     damping: float = number(
-        4000.0, 500.0, 20000.0, "D of each hand, stable on a wire that is 20 ms late; raise it if they swing [N s/m]"
+        4000.0,
+        500.0,
+        20000.0,
+        "D of each hand, stable with 20 ms of delay each way; higher: larger forces, lower: it oscillates [N s/m]",
     )
     angular_damping: float = number(256.0, 16.0, 2000.0, "the same for rotations [N m s/rad]")
-    filter: float = number(10.0, 1.0, 60.0, "low-pass of the wrenches [Hz]")
-    rate: float = number(0.105, 0.005, 0.5, "of the turn [rad/s]")
-    ramp: float = number(0.5, 0.05, 5.0, "to full rate and back [s]")
-    slow: float = number(0.006, 5e-4, 0.1, "least rate near the goal [rad/s]")
-    torque_limit: float = number(12.0, 1.0, 16.0, "on the valve; the rate goes to zero over its last 30 % [N m]")
-    lead_limit: float = number(
-        0.05, 0.005, 0.2, "commanded ahead of measured angle, at most: second line of defence [rad]"
+    filter: float = number(
+        10.0, 1.0, 60.0, "low-pass of the wrenches; lower it for a noisy sensor, which also slows the reaction [Hz]"
     )
-    force_trip: float = number(55.0, 10.0, 55.0, "on one hand: the turn ends [N]")
-    squeeze: float = number(0.0, 0.0, 30.0, "along the bar [N]")
-    tolerance: float = number(0.001, 1e-4, 0.05, "of the turned angle, by the hands [rad]")
-    stall_time: float = number(2.0, 0.2, 30.0, "without progress [s]")
+    rate: float = number(0.105, 0.005, 0.5, "of the turn, at most [rad/s]")
+    ramp: float = number(0.5, 0.05, 5.0, "time from rest to full rate, and back [s]")
+    slow: float = number(0.006, 5e-4, 0.1, "least rate near the goal [rad/s]")
+    torque_limit: float = number(
+        12.0, 1.0, 16.0, "on the valve; the rate falls to zero over its last 30 %; raise it for a stiff valve [N m]"
+    )
+    lead_limit: float = number(0.05, 0.005, 0.2, "commanded minus measured angle, at most [rad]")
+    force_trip: float = number(55.0, 10.0, 55.0, "force on one hand that ends the turn [N]")
+    squeeze: float = number(0.0, 0.0, 30.0, "internal force along the bar, positive compresses it [N]")
+    tolerance: float = number(0.001, 1e-4, 0.05, "of the turned angle as the hands measure it [rad]")
+    stall_time: float = number(2.0, 0.2, 30.0, "without progress, then it is a stall [s]")
     stall_angle: float = number(0.01, 0.001, 0.2, "that counts as progress [rad]")
-    back_off: float = number(0.07, 0.005, 0.5, "tried the other way after a stall [rad]")
+    back_off: float = number(
+        0.07, 0.005, 0.5, "turned the other way after a stall, to tell a stop from a stuck valve [rad]"
+    )
     grip_force: float = number(70.0, 5.0, 100.0, "of the finger actuator [N]")
-    grip_margin: float = number(0.005, 5e-4, 0.02, "opening off the handle's width that is no grasp [m]")
-    tug_force: float = number(8.0, 1.0, 30.0, "that proves the grasp, each hand [N]")
-    tug_speed: float = number(0.006, 0.001, 0.02, "times `damping`: most of its force on a hand [m/s]")
-    tug_reach: float = number(0.012, 0.002, 0.05, "moved so far without force: missed [m]")
+    grip_margin: float = number(0.005, 5e-4, 0.02, "a grasp is an opening within this of the handle's width [m]")
+    tug_force: float = number(8.0, 1.0, 30.0, "pull on each hand that proves the grasp [N]")
+    tug_speed: float = number(0.006, 0.001, 0.02, "pulls a hand with at most this times `damping` [m/s]")
+    tug_reach: float = number(0.012, 0.002, 0.05, "a hand that moves farther without force has missed the handle [m]")
     close_time: float = number(4.0, 0.5, 30.0, "deadline for closing [s]")
-    relax: float = number(0.6, 0.05, 10.0, "bleeding the wrenches before opening [s]")
+    relax: float = number(
+        0.6, 0.05, 10.0, "the hands yield for this long before they open, until the forces have decayed [s]"
+    )
     opening: float = number(0.085, 0.03, 0.09, "of the gripper [m]")
     open_force: float = number(40.0, 5.0, 100.0, "of the finger actuator while opening [N]")
     retreat: float = number(0.12, 0.02, 0.3, "hands drawn back after opening [m]")
     retreat_speed: float = number(0.10, 0.01, 0.3, "[m/s]")
-    tare_time: float = number(0.2, 0.02, 2.0, "time constant of the wrist sensors' tare at the stand-off [s]")
+    tare_time: float = number(0.2, 0.02, 2.0, "time constant of zeroing the wrist sensors at the stand-off [s]")
 
     def relations(self, key: str) -> None:
         require(self.slow <= self.rate, f"{key}.slow", f"at most rate, {self.rate:g}", self.slow)
@@ -92,7 +103,7 @@ class HybridRotationConfig(Config):
 
 
 def gravity_wrench(R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.ndarray:
-    """What the hand's own weight puts on the wrist sensor, in its frame -> [torque; force] (6,)."""
+    """The load of the hand's own weight on the wrist sensor, in its frame -> [torque; force] (6,)."""
     force = R_HG.T @ np.array([0.0, 0.0, -GRAVITY * geometry.hand_mass])
     p = np.array(geometry.p_SHand) * (1.0 if side == LEFT else np.array([-1.0, 1, 1]))
     return np.concatenate([cross(p, force), force])
@@ -101,7 +112,10 @@ def gravity_wrench(R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.n
 def contact_wrench(
     raw: np.ndarray, bias: np.ndarray, R_HG: np.ndarray, geometry: RobotGeometry, side: str
 ) -> np.ndarray:
-    """Load from outside on the hand, at its grip point, in H -> [torque; force] (6,)."""
+    """The external load on the hand at its grip point, in H: the reading `raw` without bias and weight.
+
+    raw, bias: in the sensor's frame (6,). -> [torque; force] (6,).
+    """
     load = raw - bias - gravity_wrench(R_HG, geometry, side)
     p_SG = np.array([0.0, 0.0, geometry.grip_behind])
     torque = load[:3] - cross(p_SG, load[3:])
@@ -122,7 +136,7 @@ class Chain:
     L: float  # distance of the hands
 
     h: np.ndarray  # h_1, h_2 of (1) (2, 6)
-    couples: np.ndarray  # what each hand puts on the valve about u (2,) [N m]
+    couples: np.ndarray  # that each hand exerts on the valve about u (2,) [N m]
     torque: float  # their sum
 
 
@@ -152,7 +166,7 @@ def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, 
     target = np.zeros(6)
     if turn_rate is not None:
         V_a[:3] += chain.u * (turn_rate - chain.u @ V_a[:3])
-        # Beyond the limit the target stops following, or the relative loop would wind a stuck valve up.
+        # Beyond the limit the target is constant, or the relative loop would build up force on a stuck valve.
         couple = float(np.clip(chain.torque, -config.torque_limit, config.torque_limit))
         target[3:] = config.squeeze * chain.b - (couple / chain.L) * chain.t
     V_a = V_a + extra
@@ -161,9 +175,10 @@ def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, 
 
 
 def turn_rate(left: float, rate: float, torque: float, lead: float, config: HybridRotationConfig, dt: float) -> float:
-    """The rate for the next tick, all along the sense of the turn (positive = towards the goal).
+    """The rate for the next tick [rad/s]. All numbers count along the sense of the turn: positive = towards the goal.
 
-    left: still to turn [rad]; rate: now; torque, lead: see the config's limits. Negative: yields to too much torque.
+    left: still to turn [rad]; rate: now; torque, lead: see the config's limits. A negative result yields to a torque
+    above its limit.
     """
     if torque > config.torque_limit:
         return (config.torque_limit - torque) / (2 * config.angular_damping)
@@ -176,26 +191,37 @@ def turn_rate(left: float, rate: float, torque: float, lead: float, config: Hybr
     return min(scaled, max(rate, 0.0) + acceleration * dt)
 
 
+Pair = tuple[np.ndarray, np.ndarray]  # of both hands, left first
+
+
+def _pair(*shape: int) -> Pair:
+    return np.zeros(shape), np.zeros(shape)
+
+
 @dc.dataclass(frozen=True)
 class Memory:
+    """Everything between two steps."""
+
     activation: int = -1
     stage: str = ""
     since: float = 0.0  # of the stage [s]
     bias: np.ndarray = dc.field(default_factory=lambda: np.zeros((2, 6)))
     tared: bool = False
     wrenches: np.ndarray = dc.field(default_factory=lambda: np.zeros((2, 6)))  # filtered, at the grip points, in H
-    X: tuple[np.ndarray, np.ndarray] | None = None  # commanded X_HG
-    q: tuple[np.ndarray, np.ndarray] | None = None  # commanded joints
-    start: tuple[np.ndarray, np.ndarray] | None = None  # X_HG at the stage's beginning
-    b0: np.ndarray | None = None  # bar direction at the grasp
+    commanding: bool = False  # X and q hold this block's own commands; not while other blocks move the hands
+    X: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # commanded X_HG
+    q: Pair = dc.field(default_factory=lambda: _pair(6))  # commanded joints
+    start: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # X_HG at the stage's beginning
+    b0: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # direction of the bar at the grasp
     turned: float = 0.0  # by the hands since the grasp, unwrapped [rad]
     commanded: float = 0.0
     rate: float = 0.0  # commanded, along the turn's sense
-    mark: tuple[float, float] = (0.0, 0.0)  # (time, angle) of the last progress
+    progress_at: tuple[float, float] = (0.0, 0.0)  # (time, angle) of the last progress
     stalls: int = 0
     stalled_at: float = 0.0
     tripped: int = 0  # ticks over the force trip
-    odd: float = 0.0  # time with an odd share or opening [s]
+    held_time: float = 0.0  # both grippers have held for so long, in grasp [s]
+    bad_grip_time: float = 0.0  # an opening or the sharing of the load is no grasp's for so long, in turn [s]
     tugged: tuple[bool, bool] = (False, False)
     status: Status = Status()
     telemetry: TurnState = TurnState()
@@ -212,8 +238,8 @@ class HybridRotation:
         view: dict[str, np.ndarray],
     ):
         config.check()
-        self.config = dc.replace(config)
-        self.marker = dc.replace(marker)
+        self.config = copy.copy(config)
+        self.marker = copy.copy(marker)
         self.geometry = geometry
         self.view = view
 
@@ -225,10 +251,10 @@ class HybridRotation:
             idle = memory if memory.activation < 0 else dc.replace(memory, activation=-1, status=Status())
             return idle, Command(time=time)
         q = (state.left_arm, state.right_arm)
-        X = tuple(self.geometry.arm_forward(q[k], side) for k, side in enumerate(SIDES))
+        X = (self.geometry.arm_forward(q[0], LEFT), self.geometry.arm_forward(q[1], RIGHT))
         m = self._sense(dt, memory, state, mode, X)
-        if mode.mode in (Mode.REACH, Mode.SERVO):  # others move the hands: what was commanded before is void
-            return dc.replace(m, activation=-1, status=Status(), X=None), Command(time=time)
+        if mode.mode in (Mode.REACH, Mode.SERVO):  # other blocks move the hands
+            return dc.replace(m, activation=-1, status=Status(), commanding=False), Command(time=time)
         p = np.array([X[0][:, 3], X[1][:, 3]])
         u = -plan.X_BV[:, 2]  # H and B have the same axes while the waist is at zero
         chain = make_chain(p, m.wrenches, u)
@@ -248,8 +274,8 @@ class HybridRotation:
         return m, command
 
     # ------------------------------------------------------------ sensing
-    def _sense(self, dt: float, m: Memory, state: RobotState, mode: ModeState, X: tuple) -> Memory:
-        """Tares the sensors while the hands stand still at the stand-off; filters the contact wrenches otherwise."""
+    def _sense(self, dt: float, m: Memory, state: RobotState, mode: ModeState, X: Pair) -> Memory:
+        """Tares the sensors while the hands stand still at the stand-off; elsewhere filters the contact wrenches."""
         raw = (state.left_wrench, state.right_wrench)
         if mode.mode == Mode.REACH:
             still = max(np.max(np.abs(state.left_arm_velocity)), np.max(np.abs(state.right_arm_velocity))) < 0.02
@@ -263,13 +289,15 @@ class HybridRotation:
             [contact_wrench(raw[k], m.bias[k], X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)]
         )
         a = 1 - np.exp(-2 * np.pi * self.config.filter * dt)
-        last = np.where(np.isfinite(m.wrenches), m.wrenches, now)  # one bad report must not stay in the filter
+        last = np.where(
+            np.isfinite(m.wrenches), m.wrenches, now
+        )  # one report that is not finite must not stay in the filter
         return dc.replace(m, wrenches=last + a * (now - last))
 
-    def _begin(self, time: float, m: Memory, mode: ModeState, X: tuple, q: tuple, chain: Chain) -> Memory:
+    def _begin(self, time: float, m: Memory, mode: ModeState, X: Pair, q: Pair, chain: Chain) -> Memory:
         stage = {Mode.GRASP: "close", Mode.TURN: "turn", Mode.RELEASE: "relax"}[Mode(mode.mode)]
-        if mode.mode == Mode.GRASP or m.X is None:
-            m = dc.replace(m, X=X, q=q, b0=chain.b, turned=0.0, commanded=0.0)
+        if mode.mode == Mode.GRASP or not m.commanding:
+            m = dc.replace(m, commanding=True, X=X, q=q, b0=chain.b, turned=0.0, commanded=0.0)
         if mode.mode == Mode.TURN:
             m = dc.replace(m, b0=chain.b, turned=0.0, commanded=0.0)
         return dc.replace(
@@ -279,10 +307,11 @@ class HybridRotation:
             since=time,
             start=m.X,
             rate=0.0,
-            mark=(time, 0.0),
+            progress_at=(time, 0.0),
             stalls=0,
             tripped=0,
-            odd=0.0,
+            held_time=0.0,
+            bad_grip_time=0.0,
             tugged=(False, False),
             status=Status(time, mode.activation, "running"),
         )
@@ -302,14 +331,14 @@ class HybridRotation:
         extra = np.zeros(6)
         if m.stage == "close":
             held = self._held(state)
-            m = dc.replace(m, odd=m.odd + dt if held else 0.0)  # here: how long both have held
-            if m.odd >= 0.4:
-                m = dc.replace(m, stage="tug", since=time, start=m.X, odd=0.0)
+            m = dc.replace(m, held_time=m.held_time + dt if held else 0.0)
+            if m.held_time >= 0.4:
+                m = dc.replace(m, stage="tug", since=time, start=m.X)
             elif time - m.since > c.close_time:
                 m = self._fail(time, m, Verdict.GRASP_MISSED, self._openings(state))
         elif m.stage == "tug":
             pull = -(chain.f @ chain.u)  # the bar holds the hands back: force into the panel
-            tugged = tuple(bool(t or f >= c.tug_force) for t, f in zip(m.tugged, pull))
+            tugged = (bool(m.tugged[0] or pull[0] >= c.tug_force), bool(m.tugged[1] or pull[1] >= c.tug_force))
             m = dc.replace(m, tugged=tugged)
             moved = max(float((m.X[k][:, 3] - m.start[k][:, 3]) @ chain.u) for k in range(2))
             if all(tugged):
@@ -371,14 +400,14 @@ class HybridRotation:
         return m, twists(chain, sense * rate, c, np.zeros(6)), gripper
 
     def _stall(self, time: float, m: Memory, sense: float, left: float) -> Memory:
-        """A stall is tried the other way: if that is free it was a stop, if it is stiff too the valve is stuck."""
+        """After a stall it turns the other way: if that is free, the stall was an end stop, else the valve is stuck."""
         c = self.config
-        since, angle = m.mark
+        since, angle = m.progress_at
         if sense * (m.turned - angle) > c.stall_angle:
-            return dc.replace(m, mark=(time, m.turned))
+            return dc.replace(m, progress_at=(time, m.turned))
         if m.stage == "back":
-            if left <= c.tolerance:  # free the other way: try again
-                return dc.replace(m, stage="turn", rate=0.0, mark=(time, m.turned), commanded=m.turned)
+            if left <= c.tolerance:  # free the other way: turn on
+                return dc.replace(m, stage="turn", rate=0.0, progress_at=(time, m.turned), commanded=m.turned)
             if time - since > c.stall_time:
                 detail = f"stiff both ways at {np.degrees(m.turned):.1f} deg, {m.telemetry.torque:.1f} N m"
                 return self._fail(time, m, Verdict.STUCK, detail)
@@ -394,7 +423,7 @@ class HybridRotation:
                 rate=0.0,
                 stalls=m.stalls + 1,
                 stalled_at=m.turned,
-                mark=(time, m.turned),
+                progress_at=(time, m.turned),
                 commanded=m.turned,
             )
         return m
@@ -410,9 +439,9 @@ class HybridRotation:
         openings = np.array([state.left_gripper, state.right_gripper])
         off = np.max(np.abs(openings - self.marker.handle_width)) > 2 * c.grip_margin
         share = chain.couples[0] / chain.torque if abs(chain.torque) > 2.0 else 0.5
-        odd = off or not 0.1 < share < 0.9
-        m = dc.replace(m, odd=m.odd + dt if odd else 0.0)
-        if m.odd > 0.5:
+        bad = off or not 0.1 < share < 0.9
+        m = dc.replace(m, bad_grip_time=m.bad_grip_time + dt if bad else 0.0)
+        if m.bad_grip_time > 0.5:
             detail = f"{self._openings(state)}, left hand carries {100 * share:.0f} %"
             return self._fail(time, m, Verdict.SLIP, detail)
         if min(self.geometry.arm_margin(state.left_arm), self.geometry.arm_margin(state.right_arm)) < 0.02:
@@ -435,12 +464,12 @@ class HybridRotation:
         if m.stage == "open":
             wide = min(state.left_gripper, state.right_gripper) > 0.9 * c.opening
             if wide or time - m.since > 2.0:
-                m = dc.replace(m, stage="back", since=time, start=m.X)
+                m = dc.replace(m, stage="retreat", since=time, start=m.X)
             return m, V, opened
-        if m.stage == "back":
+        if m.stage == "retreat":
             way = min(c.retreat, c.retreat_speed * (time - m.since))
-            X = tuple(standoff(m.start[k], self.view[side], way) for k, side in enumerate(SIDES))
-            m = self._command(m, X)
+            left, right = (standoff(m.start[k], self.view[side], way) for k, side in enumerate(SIDES))
+            m = self._command(m, (left, right))
             if way >= c.retreat:
                 status = Status(time, m.activation, "succeeded", progress=1.0, value=m.turned)
                 m = dc.replace(m, stage="away", status=status)
@@ -458,16 +487,16 @@ class HybridRotation:
             w, v = V[k, :3], V[k, 3:]
             R, p = m.X[k][:, :3], m.X[k][:, 3]
             X.append(make(rotation(w * dt) @ R, p + dt * (v + cross(w, p - chain.c))))
-        return self._command(m, tuple(X))
+        return self._command(m, (X[0], X[1]))
 
-    def _command(self, m: Memory, X: tuple) -> Memory:
-        """Takes poses as the command where inverse kinematics reaches them; a hand that cannot stays."""
+    def _command(self, m: Memory, X: Pair) -> Memory:
+        """Commands the poses X; a hand keeps its command if its pose has no inverse near the present joints."""
         q, kept = list(m.q), list(m.X)
         for k, side in enumerate(SIDES):
             solution = self.geometry.arm_inverse(X[k], side, m.q[k])
             if solution is not None and np.max(np.abs(solution - m.q[k])) < 0.5:
                 q[k], kept[k] = solution, X[k]
-        return dc.replace(m, X=tuple(kept), q=tuple(q))
+        return dc.replace(m, X=(kept[0], kept[1]), q=(q[0], q[1]))
 
     def _telemetry(self, time: float, m: Memory, chain: Chain) -> TurnState:
         couples = chain.couples

@@ -15,9 +15,10 @@ reference, by small moves of the hand; no intrinsics and no hand-eye transform a
 A consequence of (1): moving straight along the camera's view only scales s, so the view direction in the hand's
 frame is -J^-1 s* normalised; stand-offs are laid along it (grasp_geometry.standoff).
 
-The orientation is held (it comes from stage 2) and the gripper stays open. [Tahri, Chaumette: normalised moments]
+The orientation (of stage 2) is held and the gripper stays open. [Tahri, Chaumette: normalised moments]
 """
 
+import copy
 import dataclasses as dc
 
 import numpy as np
@@ -28,7 +29,7 @@ from valve_drake.frames import make
 from valve_drake.kinematics import RobotGeometry
 from valve_drake.messages import (
     LEFT,
-    REMEMBERED,
+    POSE_HISTORY,
     SIDES,
     Command,
     HandleMark,
@@ -47,13 +48,18 @@ class ImageServoConfig(Config):
     """Scenario key `image_servo`."""
 
     KEY = "image_servo"
-    gain: float = number(0.5, 0.01, 0.95, "of (3), per image; below 1, for one image of delay")
-    speed: float = number(0.06, 0.005, 0.2, "of the hand [m/s]")
-    tolerance: float = number(0.0015, 2e-4, 0.02, "distance from the reference that counts as there [m]")
-    images_in_tolerance: int = number(3, 1, 30, "in a row end it")
-    lost_after: float = number(1.0, 0.1, 30.0, "without a mark [s]")
-    sag: float = number(0.003, 1e-4, 0.02, "servo error that is compensated, at most; larger ones mean contact [m]")
-    reach: float = number(0.20, 0.02, 0.5, "farther from the start of servoing than this is a runaway [m]")
+    FORMER = {"sag": "max_droop"}
+    gain: float = number(0.5, 0.01, 0.95, "of (3), per image; higher is faster, and oscillates near 1")
+    speed: float = number(0.06, 0.005, 0.2, "of the hand, at most [m/s]")
+    tolerance: float = number(
+        0.0015, 2e-4, 0.02, "a hand this near to the reference has arrived; raise it for noisy marks [m]"
+    )
+    images_in_tolerance: int = number(3, 1, 30, "in a row, until it succeeds")
+    lost_after: float = number(1.0, 0.1, 30.0, "without a mark, then it fails [s]")
+    max_droop: float = number(
+        0.003, 1e-4, 0.02, "tracking error that is compensated, at most; a larger one means contact [m]"
+    )
+    reach: float = number(0.20, 0.02, 0.5, "a hand farther than this from where servoing began has gone astray [m]")
     opening: float = number(0.085, 0.03, 0.09, "of the gripper [m]")
     gripper_force: float = number(40.0, 5.0, 100.0, "of the finger actuator [N]")
 
@@ -64,19 +70,21 @@ class Hand:
 
     X_HG: np.ndarray  # commanded pose (3, 4)
     start: np.ndarray  # p_HG at the beginning
-    goal: np.ndarray  # p_HG that the last image asks for
+    goal: np.ndarray  # p_HG to move to, by the last image
     q: np.ndarray
     seen: int = -1
     seen_at: float = 0.0
     error: np.ndarray = dc.field(default_factory=lambda: np.full(3, np.nan))
     inside: int = 0  # images in tolerance in a row
-    past: tuple[tuple[float, np.ndarray], ...] = ()  # (time, p_HG measured plus what lacks to the command), newest last
+    past: tuple[tuple[float, np.ndarray], ...] = ()  # time; measured grip point + tracking error (clipped to max_droop)
 
 
 @dc.dataclass(frozen=True)
 class Memory:
+    """Everything between two steps."""
+
     activation: int = -1
-    hands: dict[str, Hand] | None = None
+    hands: dict[str, Hand] = dc.field(default_factory=dict)
     status: Status = Status()
 
 
@@ -85,7 +93,7 @@ class ImageServo:
 
     def __init__(self, config: ImageServoConfig, geometry: RobotGeometry, taught: dict[str, TaughtReference]):
         config.check()
-        self.config = dc.replace(config)
+        self.config = copy.copy(config)
         self.geometry = geometry
         self.taught = taught
 
@@ -128,10 +136,11 @@ class ImageServo:
     def _hand(self, time: float, dt: float, hand: Hand, state: RobotState, side: str, mark: HandleMark) -> Hand:
         q = state.left_arm if side == LEFT else state.right_arm
         p_now = self.geometry.arm_forward(q, side)[:, 3]
-        short = hand.X_HG[:, 3] - p_now  # joints that stand off their command for ever must not keep the hand off
-        short = short * min(1.0, self.config.sag / max(float(np.linalg.norm(short)), 1e-12))
-        gone = int(bool(hand.past) and hand.past[0][0] < time - REMEMBERED)
-        hand = dc.replace(hand, past=(*hand.past[gone:], (time, p_now + short)))
+        # A constant servo error would bias the hand: it is compensated.
+        droop = hand.X_HG[:, 3] - p_now
+        droop = droop * min(1.0, self.config.max_droop / max(float(np.linalg.norm(droop)), 1e-12))
+        gone = int(bool(hand.past) and hand.past[0][0] < time - POSE_HISTORY)
+        hand = dc.replace(hand, past=(*hand.past[gone:], (time, p_now + droop)))
         if mark.found and mark.sequence != hand.seen and mark.time >= hand.past[0][0]:
             e = self.taught[side].displacement(mark.feature)
             R = hand.X_HG[:, :3]
@@ -146,7 +155,7 @@ class ImageServo:
             )
         elif not mark.found and mark.sequence != hand.seen:
             hand = dc.replace(hand, seen=mark.sequence, inside=0)
-        if time - hand.seen_at > 0.25:  # blind: stand still
+        if time - hand.seen_at > 0.25:  # no image for a while: stand still
             hand = dc.replace(hand, goal=hand.X_HG[:, 3])
         step = hand.goal - hand.X_HG[:, 3]
         most = self.config.speed * dt
@@ -155,7 +164,7 @@ class ImageServo:
         X_HG = make(hand.X_HG[:, :3], p)
         solution = self.geometry.arm_inverse(X_HG, side, hand.q)
         if solution is None or np.max(np.abs(solution - hand.q)) > 0.5:
-            return hand  # at the edge of reach, or the wrist would swing round: stay
+            return hand  # out of reach, or the wrist would turn by far: keep the command
         return dc.replace(hand, X_HG=X_HG, q=solution)
 
     def _judge(self, time: float, activation: int, hands: dict[str, Hand]) -> Status:

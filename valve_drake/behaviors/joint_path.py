@@ -11,12 +11,12 @@ import numpy as np
 
 Free = Callable[[np.ndarray], bool]
 STEP = 0.03  # largest joint step between two checks [rad]
-LEAVE = 0.06  # the robot is at the start, free or not: this near to it nothing is asked [rad]
+LEAVE = 0.06  # poses this near to the start are not checked: the robot is there, free or not [rad]
 
 
 @dc.dataclass(frozen=True)
 class Path:
-    """Way points of both arms, passed with a rest at each: trapezoidal speed along every leg.
+    """Way points of both arms, with a stop at each: trapezoidal speed along every leg.
 
     points: (N, 12) [rad]; start: when it begins [s].
     """
@@ -39,7 +39,7 @@ class Path:
 
     def sample(self, time: float) -> np.ndarray:
         """Joint angles at `time` -> (12,)."""
-        left = max(time - self.start, 0.0)  # a leg without length is over before it begins
+        left = max(time - self.start, 0.0)  # a leg without length takes no time
         for k, duration in enumerate(self.durations()):
             if left < duration:
                 a, b = self.points[k], self.points[k + 1]
@@ -60,7 +60,7 @@ def _trapezoid(t: float, duration: float, reach: float, acceleration: float) -> 
 
 
 def line_is_free(a: np.ndarray, b: np.ndarray, is_free: Free) -> bool:
-    """Every checked sample of the joint line after `a` is free; the middle is looked at first (it fails soonest)."""
+    """Whether every checked sample of the joint line after `a` is free; the middle first, which fails most often."""
     count = max(1, int(np.ceil(np.max(np.abs(b - a)) / STEP)))
     order = sorted(range(1, count + 1), key=lambda k: abs(k / count - 0.5))
     return all(is_free(a + (b - a) * (k / count)) for k in order)
@@ -69,7 +69,7 @@ def line_is_free(a: np.ndarray, b: np.ndarray, is_free: Free) -> bool:
 def find_path(
     start: np.ndarray, goal: np.ndarray, vias: Sequence[np.ndarray], is_free: Free, *, tries: int = 400
 ) -> np.ndarray | None:
-    """Way points (N, 12) from start to goal, or None. The start itself may touch (it is where the robot is)."""
+    """Way points (N, 12) from start to goal, or None. The start need not be free: the robot is there."""
     if not is_free(goal):
         return None
 

@@ -1,16 +1,17 @@
-"""Stage 3: the arms by forward and inverse kinematics; and the two looks at rest, before and after the turn.
+"""Stage 3: the arms by forward and inverse kinematics; and the measurements at rest before and after the turn.
 
-What it does in each mode:
-    idle, search, approaches  holds the arms at home; from every good estimate in fine_approach it says where to stand
+In each mode:
+    idle, search, approaches  holds the arms at home; fine_approach: computes the stance from every good estimate
     measure   several frames at rest -> the valve's pose in the base and the grasps (GraspPlan)
     reach     a collision-free joint path of both arms to the stand-off before the handles, offset along the wrist
               cameras' view; ends on arrival, or before when both green marks are large enough in the wrist images
-    verify    arms back home, several frames at rest: the angle that the camera sees decides
+    verify    arms back home, several frames at rest: the angle that the camera measures decides
     retreat   holds home
 
 Frames: frames.py. The base stands still from measure to verify.
 """
 
+import copy
 import dataclasses as dc
 from collections.abc import Callable
 
@@ -18,11 +19,11 @@ import numpy as np
 
 from valve_drake.behaviors.grasp_geometry import (
     StanceConfig,
+    angle_turned,
     best_arc,
     find_stance,
     hand_in_valve,
     standoff,
-    turn_between,
     turned,
 )
 from valve_drake.behaviors.joint_path import Path, find_path
@@ -57,15 +58,17 @@ class KinematicApproachConfig(Config):
     home: list[float] = numbers(
         [1.05, 0.65, -1.9, 0.0, 1.25, 0.0], (-ARM_LIMITS).tolist(), ARM_LIMITS.tolist(), "left arm; mirrored [rad]"
     )
-    joint_speed: float = number(0.9, 0.05, 2.5, "of the fastest joint [rad/s]")
+    joint_speed: float = number(0.9, 0.05, 2.5, "of the fastest joint of a path [rad/s]")
     joint_acceleration: float = number(2.0, 0.1, 20.0, "[rad/s^2]")
     settle: float = number(0.3, 0.05, 5.0, "stillness before a measurement [s]")
     rest: float = number(0.8, 0.05, 10.0, "stillness at the stand-off, in which the wrist sensors are tared [s]")
-    frames: int = number(6, 1, 50, "estimates of one measurement at rest")
-    mark_ratio: float = number(0.9, 0.3, 1.5, "sqrt(area) of the green mark over the taught one at which reaching ends")
+    frames: int = number(6, 1, 50, "estimates in one measurement at rest; more are slower and more accurate")
+    mark_ratio: float = number(
+        0.9, 0.3, 1.5, "reaching ends early when sqrt(area) of both green marks is this share of the taught one"
+    )
     opening: float = number(0.085, 0.03, 0.09, "gripper open [m]")
     gripper_force: float = number(40.0, 5.0, 100.0, "while opening [N]")
-    stance_period: float = number(0.5, 0.1, 10.0, "between two searches for the stance [s]")
+    stance_period: float = number(0.5, 0.1, 10.0, "between two computations of the stance [s]")
     angle_tolerance: float = number(0.035, 0.002, 0.2, "camera angle against the command that counts as turned [rad]")
     still_rate: float = number(
         0.0017, 1e-4, 0.05, "a valve that turns slower stands still; its final angle is taken then [rad/s]"
@@ -86,21 +89,21 @@ class Memory:
     mode: str = ""
     phase: str = ""
     since: float = 0.0  # of the phase [s]
-    q: np.ndarray | None = None  # command of both arms (12,)
+    q: np.ndarray = dc.field(default_factory=lambda: np.zeros(12))  # command of both arms [rad]
     path: Path | None = None
     looks: tuple[RectangleEstimate, ...] = ()
     seen: int = -1  # sequence of the newest estimate used
     stance_looks: tuple[RectangleEstimate, ...] = ()
     stance: Stance = Stance()
-    stance_at: float = -1e9  # when it was looked for [s]
+    stance_at: float = -1e9  # when it was computed [s]
     X_OV0: np.ndarray | None = None  # the valve before the turn
     plan: GraspPlan = GraspPlan()
     status: Status = Status()
 
 
-# The arms belong to others, or are held where they are: what comes next starts from there.
-OTHERS = (Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE, Mode.DONE, Mode.FAILED, Mode.STOPPED)
-NEAR = 1.5  # a valve farther from the base than this is out of the arms' way [m]
+# Modes in which another block moves the arms; on return the commands start from the measured joints.
+NOT_OWNED = (Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE, Mode.DONE, Mode.FAILED, Mode.STOPPED)
+NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms [m]
 
 
 class KinematicApproach:
@@ -124,9 +127,9 @@ class KinematicApproach:
         config.check()
         stance.check()
         marker.check()
-        self.config = dc.replace(config)
-        self.stance = dc.replace(stance)
-        self.marker = dc.replace(marker)
+        self.config = copy.copy(config)
+        self.stance = copy.copy(stance)
+        self.marker = copy.copy(marker)
         self.geometry = geometry
         self.view = view
         self.reference_area = reference_area
@@ -146,13 +149,13 @@ class KinematicApproach:
     ) -> tuple[Memory, Command]:
         """One tick -> new memory (with status, stance and plan in it), command. `watch_stance` follows it."""
         measured = np.concatenate([state.left_arm, state.right_arm])
-        m = memory
+        m, first = memory, memory.activation < 0
         if mode.activation != m.activation:
             m = dc.replace(m, activation=mode.activation, mode=mode.mode, phase="start", since=time, looks=())
             m = dc.replace(m, status=Status(time=time, activation=mode.activation, state="idle"))
-        if m.q is None or mode.mode in OTHERS:
+        if first or mode.mode in NOT_OWNED:
             m = dc.replace(m, q=measured, path=None)
-        if mode.mode in OTHERS:
+        if mode.mode in NOT_OWNED:
             return m, Command(time=time)
         run = {Mode.MEASURE: self._measure, Mode.REACH: self._reach, Mode.VERIFY: self._verify}
         if mode.mode in run:
@@ -170,7 +173,7 @@ class KinematicApproach:
         return dc.replace(m, status=Status(time, m.activation, state, verdict, detail))
 
     def _valve(self, m: Memory, state: RobotState, turn: TurnState) -> np.ndarray | None:
-        """X_BV of the valve that was measured last, as the hands left it; None if there is none near."""
+        """X_BV of the valve that was measured last, turned as the hands left it; None if there is none near."""
         if m.X_OV0 is None:
             return None
         X_BV = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OV0, turn.angle))
@@ -200,11 +203,11 @@ class KinematicApproach:
         return dc.replace(m, phase="moving", path=path, since=time)
 
     def _vias(self, q: np.ndarray, goal: np.ndarray, X_BV: np.ndarray | None) -> list[np.ndarray]:
-        """Hands drawn straight back from whichever end is at the valve: a way out that is nearly always free."""
+        """Via poses: both hands drawn straight back from the end of the path at the valve; nearly always free."""
         if X_BV is None:
             return []
         at_valve = q if np.allclose(goal, self.home) else goal
-        out = []
+        out: list[np.ndarray] = []
         for back in (0.10, 0.16, 0.22):
             arms = []
             for k, side in enumerate(SIDES):
@@ -212,17 +215,18 @@ class KinematicApproach:
                 X_HG = standoff(X_HG, np.array([0.0, 0, 1]), back)
                 X_HG = X_HG + np.array([[0, 0, 0, 0], [0, 0, 0, lateral(side) * back / 2], [0, 0, 0, 0]])
                 arms.append(self.geometry.arm_inverse(X_HG, side, at_valve[6 * k : 6 * k + 6]))
-            if all(a is not None for a in arms):
-                out.append(np.concatenate(arms))
+            reached = [q for q in arms if q is not None]
+            if len(reached) == len(arms):
+                out.append(np.concatenate(reached))
         return out
 
     # ------------------------------------------------------------ stance
     def watch_stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
-        """In fine approach: where the base should stand. It takes as long as two ticks may, and no command needs it."""
+        """Computes the stance, in fine_approach. Slow (up to two ticks), and no command of this tick needs it."""
         return self._find_stance(time, m, mode, estimate) if mode.mode == Mode.FINE_APPROACH else m
 
     def _find_stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
-        """Where to stand, from the last few estimates; the nearer the better, so old ones are dropped."""
+        """The stance from the last few estimates: those from nearby are better, so old ones are dropped."""
         if not estimate.found or estimate.sequence == m.seen:
             return m
         looks = (*m.stance_looks, estimate)[-5:]
@@ -332,7 +336,8 @@ class KinematicApproach:
             near = self.geometry.arm_inverse(compose(X_HB, X_BG), side)
             X_HG = compose(X_HB, standoff(X_BG, self.view[side], self.stance.standoff))
             arms.append(self.geometry.arm_inverse(X_HG, side, near))
-        return None if any(a is None for a in arms) else np.concatenate(arms)
+        reached = [q for q in arms if q is not None]
+        return np.concatenate(reached) if len(reached) == len(arms) else None
 
     # ------------------------------------------------------------ verify
     def _verify(
@@ -382,7 +387,7 @@ class KinematicApproach:
         poses = [compose(look.X_OL, look.X_LV) for look in looks]
         slopes = [  # of all pairs: their median is not moved by one wrong estimate
             # the rectangle repeats every quarter turn
-            wrap(turn_between(poses[i], poses[k]), np.pi / 2) / (looks[k].time - looks[i].time)
+            wrap(angle_turned(poses[i], poses[k]), np.pi / 2) / (looks[k].time - looks[i].time)
             for k in range(len(looks))
             for i in range(k)
         ]
@@ -405,4 +410,4 @@ class KinematicApproach:
         """The turned angle by camera [rad]. The rectangle repeats every quarter turn, with the green marks every half:
         the branch nearest to what the hands felt is taken, the value is the camera's."""
         period = np.pi if axis_known else np.pi / 2
-        return by_hands + wrap(turn_between(X_OV0, X_OV1) - by_hands, period)
+        return by_hands + wrap(angle_turned(X_OV0, X_OV1) - by_hands, period)

@@ -20,6 +20,7 @@ Which side is which is settled last: green marks, else sizes, else the track, el
 import dataclasses as dc
 import functools
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -846,7 +847,7 @@ class FusedPose:
     reason: str = ""
 
 
-def fuse(estimates: list[RectangleEstimate], common: float = 0.2, gate: float = 4.0) -> FusedPose:
+def fuse(estimates: Sequence[RectangleEstimate], common: float = 0.2, gate: float = 4.0) -> FusedPose:
     """Mean pose of estimates at rest, each weighted by its covariance, outliers dropped.
 
     common: share of an estimate's variance that all frames have in common (lens, pixel phase: the robot stands

@@ -27,7 +27,7 @@ from drake import (
 from valve_drake.camera.image_file import jpeg_size
 from valve_drake.checks import require
 from valve_drake.config import Config, number, numbers, plain, texts
-from valve_drake.messages import REMEMBERED, SIDES, CameraFrame, Mode
+from valve_drake.messages import POSE_HISTORY, SIDES, CameraFrame, Mode
 from valve_drake.ports import SLOT, TICK
 from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.network import LOOPBACK, NAME, group_of
@@ -301,7 +301,7 @@ class HardwareConfig(Config):
         30.0, TICK, 600.0, "a robot that has not reported everything after this long does not answer [s]"
     )
     report_age: float = number(0.1, 0.02, 0.1, "a wrist sensor silent for longer reads NaN [s]")
-    image_age: float = number(0.8, TICK, REMEMBERED, "an image older than this is not shown [s]")
+    image_age: float = number(0.8, TICK, POSE_HISTORY, "an image older than this is not shown [s]")
     command_age: float = number(0.1, 0.02, 0.1, "on the robot: without commands for longer its joints stop [s]")
     robot_period: float = number(1 / 32, TICK, 1 / 32, "of robot.state [s]")
     request_period: float = number(1 / 32, TICK, 0.25, "of cameras.request [s]")
