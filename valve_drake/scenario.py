@@ -132,10 +132,11 @@ def with_overrides(scenario: Scenario, overrides: typing.Sequence[str]) -> Scena
     """The scenario with `key=value` overrides, checked. Raises ConfigError as `load` does."""
     for override in overrides:
         key, value = split_override(override)
-        given = yaml_file.parse(value, f"--set {key}", TAGS)
+        source = f"--set {key}"
+        given = yaml_file.parse(value, source, TAGS)
         for name in reversed(key.split(".")):
             given = {name: given}
-        scenario = config.build(scenario, given, "--set")
+        scenario = config.build(scenario, given, source)
     scenario.check()
     return scenario
 

@@ -3,8 +3,12 @@
 Zhang's method: OpenCV gives the start, one bundle adjustment (Levenberg-Marquardt, analytic Jacobian) ends it for both
 lens models, so that both are judged on the same corners:
 
-    opencv  K and the distortion k1, k2, p1, p2, k3
+    opencv  K and of the distortion k1, k2, p1, p2, k3 those terms that the corners determine, the others 0
     paper   eq. (1), (2): k_x, k_y, u_0, v_0, k_u, k_v
+
+A term is fitted if it lowers the residuals by more than chance would (Bayes's criterion), and only if the lens then
+maps the whole image one to one. What a lens may be where no board was is part of the answer: `sigma_map`, the standard
+deviation of a pixel over the image with the terms left out counted as unknown.
 
 The root mean square of the residuals does not tell whether a calibration is good. What does: the standard deviations,
 and `split_half`, the difference of points triangulated by two calibrations from every second view.
@@ -34,6 +38,17 @@ _MIN_TILT = 8.0  # of the steepest board, and between two: less does not tell th
 _TILT = "tilt it by up to 45 deg to all sides, or give --distances"
 _OUTLIER = 2.5  # times the median view's rms
 _APART = 0.15  # turn [rad] plus shift over the boards' distance by which pairs put the right camera elsewhere
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+# Sets of distortion terms, as indices of _COEFFICIENTS: k3 never without k2, nor k2 without k1. The first is the start.
+_TERMS = ((0, 1, 2, 3, 4), (0, 1, 2, 3), (0, 2, 3), (2, 3), (0, 1, 4), (0, 1), (0,), ())
+_FRONTAL_TERMS = ((0,), ())
+_POWER = (2, 4, 1, 1, 6)  # of the radius, by which each acts
+_PRIOR = (0.2, 0.1, 2e-3, 2e-3, 0.05)  # what each may change at the image's corner, relative to the radius
+KNOWN = 1.0  # standard deviation of a pixel up to which the lens counts as known there [px]
+_MAP = (7, 9)  # rows and columns of the map of standard deviations
+_POOR = 0.2  # rms of a camera's corners beyond which a fisheye's model is tried [px]
+_FISHEYE = 0.6  # of a pinhole's rms, below which a fisheye's says that it is one
+_WORSE = 1.2  # by how much fewer terms may raise the rms, so that the lens maps the whole image one to one
 _MISFIT = 10.0  # rms of both cameras over that of each alone, beyond which the pairs are none
 
 
@@ -93,6 +108,7 @@ class Calibration:
     split_half: dict[float, float] | None  # range [m] -> difference [m], stereo only
     depth_sigma: dict[float, float]  # range [m] -> standard deviation by the covariance [m], stereo only
     pitch: tuple[float, float] | None  # triangulated pitch over the true one: mean, standard deviation
+    unknown: tuple[float, ...]  # share of each image in which the lens is known to worse than KNOWN
 
 
 # ---------------------------------------------------------------- lens models with their derivatives
@@ -103,7 +119,7 @@ class _OpenCvKind:
 
     def __init__(self, free: Sequence[int]):
         self.free = list(free)
-        self.names = ("fx", "fy", "cx", "cy", *(("k1", "k2", "p1", "p2", "k3")[k] for k in self.free))
+        self.names = ("fx", "fy", "cx", "cy", *(_COEFFICIENTS[k] for k in self.free))
 
     def start(self, K: np.ndarray, dist: np.ndarray) -> np.ndarray:
         return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *dist[self.free]])
@@ -238,6 +254,18 @@ def _solve(views: Sequence[View], kind: Any, name: str, start: _State, size: tup
 # ---------------------------------------------------------------- intrinsics and stereo
 
 
+@dc.dataclass(frozen=True)
+class _Start:
+    """OpenCV's answer for each camera alone, and what follows for both."""
+
+    views: tuple[View, ...]  # numbered so that the cameras agree
+    lenses: list[tuple[np.ndarray, np.ndarray]]  # (K, dist) of each camera
+    X_LR: np.ndarray | None
+    poses: tuple[np.ndarray, ...]  # X_LT of each body
+    alone: tuple[float, ...]  # rms of the corners of each camera [px]
+    misfits: list[tuple[str, ...]]  # names of the pairs that put the right camera elsewhere than most do
+
+
 def board_views(
     board: Board,
     names: Sequence[tuple[str, ...]],
@@ -268,10 +296,11 @@ def calibrate(
     if len(views) < least:
         raise ConfigError(f"the board was found in {len(views)} view(s): a calibration needs at least {least}")
     # Boards that are all frontal show little of a lens: what they cannot tell must not be fitted.
-    kinds = {"opencv": _OpenCvKind([0] if rigid else range(5)), "paper": _PaperKind()}
-    fits = {}
-    start = _start(views, size, kinds["opencv"], rigid, board)
+    sets = _FRONTAL_TERMS if rigid else _TERMS
+    start = _start(views, size, _OpenCvKind(sets[0]), rigid, board)
     views = start.views
+    kinds = {"opencv": _OpenCvKind(sets[0]), "paper": _PaperKind()}
+    fits = {}
     for name, model in kinds.items():
         lenses = tuple(model.start(K, dist) for K, dist in start.lenses)
         try:
@@ -279,9 +308,14 @@ def calibrate(
         except np.linalg.LinAlgError as error:
             raise ConfigError(f"degenerate: the boards do not determine a camera: {_TILT}") from error
     _refuse_misfits(fits["opencv"], start)
+    _refuse_fisheye(start, size)
+    fits["opencv"] = _determined(fits["opencv"], views, sets, size)
+    kinds["opencv"] = _OpenCvKind(_free(fits["opencv"]))
     _refuse_vague(fits["opencv"], rigid)
     better = min(fits, key=lambda name: _information(fits[name]))
     fit = fits[better if kind == "best" else kind]
+    maps = _sigma_maps(fits["opencv"], fit, views, size)
+    fit = dc.replace(fit, lenses=tuple(dc.replace(lens, sigma_px=m.tolist()) for lens, m in zip(fit.lenses, maps)))
     for side, lens in zip(("left", "right"), fit.lenses):
         lens.check(side if len(fit.lenses) == 2 else "camera")
     stereo = fit.X_LR is not None
@@ -293,19 +327,117 @@ def calibrate(
         split_half=_split_half(fit, views, kinds[fit.kind], size, least) if stereo else None,
         depth_sigma=_depth_sigma(fit, kinds[fit.kind], size) if stereo else {},
         pitch=_pitch(fit, views, board) if stereo and board else None,
+        unknown=tuple(float((m > KNOWN).mean()) for m in maps),
     )
 
 
-@dc.dataclass(frozen=True)
-class _Start:
-    """OpenCV's answer for each camera alone, and what follows for both."""
+def _free(fit: Fit) -> list[int]:
+    """The distortion terms that an OpenCV fit has."""
+    own = {name.split(".")[-1] for name in fit.names}
+    return [k for k, name in enumerate(_COEFFICIENTS) if name in own]
 
-    views: tuple[View, ...]  # numbered so that the cameras agree
-    lenses: list[tuple[np.ndarray, np.ndarray]]  # (K, dist) of each camera
-    X_LR: np.ndarray | None
-    poses: tuple[np.ndarray, ...]  # X_LT of each body
-    rms: float  # over all corners, each camera alone [px]
-    misfits: list[tuple[str, ...]]  # names of the pairs that put the right camera elsewhere than most do
+
+def _folds(fit: Fit) -> bool:
+    """Whether some lens of an OpenCV fit does not map its whole image one to one."""
+    return any(reach < corner for reach, corner in (lens.radial_reach() for lens in fit.lenses))
+
+
+def _determined(full: Fit, views: Sequence[View], sets: Sequence[Sequence[int]], size: tuple[int, int]) -> Fit:
+    """The fit, of those with each set of terms, that explains the corners best for its number of parameters.
+
+    Raises ConfigError if all lenses fold back inside the image.
+    """
+    values, names = parameters(full), list(full.names)
+    sides = ("left.", "right.") if len(full.lenses) == 2 else ("",)
+
+    def without(free: Sequence[int]) -> float:
+        """The criterion of a fit with these terms only. They act linearly, so that `full` tells what it leaves."""
+        out = [side + _COEFFICIENTS[k] for side in sides for k in sets[0] if k not in free]
+        at = [names.index(name) for name in out]
+        value = np.array([values[name] for name in out])
+        more = value @ np.linalg.pinv(full.covariance[np.ix_(at, at)], hermitian=True) @ value if at else 0.0
+        return _criterion(full, more, len(names) - len(at))
+
+    for free in sorted(sets, key=without):
+        fit = full
+        if len(free) < len(sets[0]):
+            model = _OpenCvKind(free)
+            lenses = tuple(np.array([values[side + name] for name in model.names]) for side in sides)
+            fit = _solve(views, model, "opencv", _State(lenses, full.X_LR, full.poses), size)
+        if not _folds(fit) and fit.rms < _WORSE * full.rms:
+            return fit
+    raise ConfigError(
+        f"degenerate: the lens that fits the corners (rms {full.rms:.2f} px) folds back inside the image, none that "
+        "does not fits them: show boards up to the image's corners, or is it a fisheye's?"
+    )
+
+
+def _refuse_fisheye(start: _Start, size: tuple[int, int]) -> None:
+    """Raises ConfigError where a fisheye's model explains the corners of a camera much better than a pinhole's."""
+    views = start.views
+    for c, rms in enumerate(start.alone):
+        if rms < _POOR:
+            continue
+        bodies = sorted({view.body for view in views})
+        groups = [[view for view in views if view.body == body] for body in bodies]
+        points = [np.vstack([view.points for view in group]).reshape(-1, 1, 3) for group in groups]
+        px = [np.vstack([view.px[c] for view in group]).reshape(-1, 1, 2) for group in groups]
+        flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
+        flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
+        try:
+            other = cv2.fisheye.calibrate(points, px, size, start.lenses[c][0].copy(), np.zeros(4), flags=flags)[0]
+        except cv2.error:  # no start
+            continue
+        if math.isfinite(other) and other < _FISHEYE * rms:
+            raise ConfigError(
+                f"the images are a fisheye's: its model leaves {other:.2f} px of the corners, a pinhole's with "
+                f"distortion {rms:.2f} px; this program has no fisheye lens"
+            )
+
+
+def _sigma_maps(opencv: Fit, fit: Fit, views: Sequence[View], size: tuple[int, int]) -> list[np.ndarray]:
+    """Standard deviation of where each lens of `fit` puts what is seen at a pixel, on a grid over the image [px].
+
+    By the corners, with all terms of the distortion: those that `opencv` leaves out may be as large as lenses have
+    them (`_PRIOR`). A turn of the whole camera is no error of its lens: it is taken out where the boards are. The
+    difference between `opencv` and another model counts, too.
+    """
+    kind = _OpenCvKind(range(5))
+    problem = _Problem(views, kind, size)
+    fitted = [np.concatenate([np.diag(lens.K)[:2], lens.K[:2, 2], lens.dist]) for lens in opencv.lenses]
+    cost, H, _, residuals = problem(_State(tuple(fitted), opencv.X_LR, opencv.poses))
+    corners = sum(len(r) for view in residuals for r in view)
+    H = H / max(cost / max(2 * corners - len(H), 1), 1e-12)
+    u, v = np.meshgrid(np.linspace(0, size[0] - 1, _MAP[1]), np.linspace(0, size[1] - 1, _MAP[0]))
+    grid = np.stack([u, v], -1).reshape(-1, 2)
+    free = _free(opencv)
+    for c, lens in enumerate(opencv.lenses):
+        reach = np.linalg.norm(lens.normalize(np.array([[0.0, 0.0], size])), axis=1).max()
+        for k in set(range(5)) - set(free):
+            at = c * len(kind.names) + 4 + k
+            H[at, at] += 1 / (_PRIOR[k] / reach ** _POWER[k]) ** 2
+    scale = np.sqrt(np.diag(H)) + 1e-150
+    inverse = np.linalg.pinv(H / np.outer(scale, scale), rcond=1e-15, hermitian=True) / np.outer(scale, scale)
+    maps = []
+    for c, (lens, chosen) in enumerate(zip(opencv.lenses, fit.lenses)):
+        own = slice(c * len(kind.names), (c + 1) * len(kind.names))
+        C = inverse[own, own]
+        seen = np.vstack([view.px[c] for view in views])
+        seen = seen[:: max(len(seen) // 500, 1)]
+        J, turn, other = [], [], []
+        for px in (seen, grid):
+            xy = lens.normalize(px)
+            _, D, by_lens = kind.project(lens, xy)
+            rays = np.column_stack([xy, np.ones(len(xy))])
+            J.append(by_lens)
+            turn.append(D @ divided(xy, np.ones(len(xy))) @ -skew(rays))
+            other.append((chosen.project(xy) - px)[..., None])
+        back = np.linalg.pinv(turn[0].reshape(-1, 3))
+        J_left = J[1] - turn[1] @ (back @ J[0].reshape(-1, len(kind.names)))
+        difference = other[1] - turn[1] @ (back @ other[0].reshape(-1, 1))
+        variance = np.einsum("nij,jk,nik->n", J_left, C, J_left) + (difference**2).sum((1, 2))
+        maps.append(np.round(np.sqrt(np.maximum(variance, 0)).reshape(_MAP), 3).clip(0, 1e5))
+    return maps
 
 
 def _start(views: Sequence[View], size: tuple[int, int], kind: _OpenCvKind, rigid: bool, board: Board | None) -> _Start:
@@ -341,7 +473,7 @@ def _start(views: Sequence[View], size: tuple[int, int], kind: _OpenCvKind, rigi
         seen.append(px)
     lenses = [(K, dist) for K, dist, *_ in alone]
     poses = [tuple(transform(r, t) for r, t in zip(*one[2:4])) for one in alone]
-    rms = math.sqrt(np.mean([one[4] ** 2 for one in alone]))
+    rms = tuple(one[4] for one in alone)
     if len(alone) == 1:
         return _Start(tuple(views), lenses, None, poses[0], rms, [])
     turns = board.turns() if board and not rigid else (0,)
@@ -401,12 +533,13 @@ def _refuse_frontal(normals: Sequence[np.ndarray]) -> None:
 
 def _refuse_misfits(fit: Fit, start: _Start) -> None:
     """Raises ConfigError where each camera alone fits its corners, but the pairs do not fit one another."""
-    if fit.X_LR is None or fit.rms < 1 + _MISFIT * start.rms:
+    alone = math.sqrt(np.mean(np.square(start.alone)))
+    if fit.X_LR is None or fit.rms < 1 + _MISFIT * alone:
         return
     pairs = ", ".join(" with ".join(names) for names in start.misfits[:6])
     which = f"look at {pairs}" if 0 < len(start.misfits) <= len(start.views) / 2 else "no two of them agree"
     raise ConfigError(
-        f"the pairs do not fit one another (rms {fit.rms:.1f} px, each camera alone {start.rms:.2f} px): {which}; "
+        f"the pairs do not fit one another (rms {fit.rms:.1f} px, each camera alone {alone:.2f} px): {which}; "
         "are they images of one moment, left with left?"
     )
 
@@ -426,9 +559,14 @@ def tilts(fit: Fit) -> list[float]:
 
 
 def _information(fit: Fit) -> float:
-    """Akaike's criterion: smaller explains the corners better for the number of parameters."""
+    """Bayes's criterion (Schwarz): smaller explains the corners better for the number of parameters."""
+    return _criterion(fit, 0.0, len(fit.names))
+
+
+def _criterion(fit: Fit, more: float, parameters: int) -> float:
+    """Bayes's criterion of residuals that are larger than those of `fit`, by `more` times a corner's variance."""
     n = 2 * sum(len(r) for view in fit.residuals for r in view)
-    return n * math.log(max(fit.rms, 1e-9) ** 2) + 2 * len(fit.names)
+    return n * math.log(max(fit.rms, 1e-9) ** 2 * (1 + more / n)) + math.log(n) * parameters
 
 
 def parameters(fit: Fit) -> dict[str, float]:
@@ -440,7 +578,7 @@ def parameters(fit: Fit) -> dict[str, float]:
         else:
             K = lens.K
             values = dict(zip(("fx", "fy", "cx", "cy"), (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
-            values |= {name: value for name, value in zip(("k1", "k2", "p1", "p2", "k3"), lens.dist)}
+            values |= {name: value for name, value in zip(_COEFFICIENTS, lens.dist)}
         out |= {side + name: float(value) for name, value in values.items()}
     return out
 

@@ -2,6 +2,7 @@
 
 import html
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from valve_drake import frames
 from valve_drake.camera.calibration import Calibration
 
 _GRID = np.array([10, 8])  # cells of an image, for coverage
+_MADE = "<meta name='generator' content='valve-drake calibrate'>"
 _ENLARGED = 50  # residuals in the maps
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1c2430; max-width: 1080px; margin: 2em auto; padding: 0 1em }
@@ -26,6 +28,15 @@ figure { display: inline-block; margin: 0 1em 0 0 }
 .note { color: #667 }
 .warn { background: #fff4e0; border-left: 4px solid #e39a1a; padding: .3em .8em; margin: .3em 0 }
 """
+
+
+def is_page(path: Path) -> bool:
+    """Whether a file is a page that `calibrate` wrote, which a new one may replace."""
+    try:
+        with open(path, "rb") as file:
+            return _MADE.encode() in file.read(1000)
+    except OSError:
+        return False
 
 
 def cells(px: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -76,7 +87,7 @@ def cameras(numbers: dict[str, Any], result: Calibration, size: tuple[int, int])
 
 
 def page(title: str, parts: Sequence[str]) -> str:
-    head = f"<meta charset='utf-8'><title>{html.escape(title)}</title><style>{_STYLE}</style>"
+    head = f"<meta charset='utf-8'>{_MADE}<title>{html.escape(title)}</title><style>{_STYLE}</style>"
     return f"<!doctype html><html lang='en'><head>{head}</head><body>{''.join(parts)}</body></html>\n"
 
 

@@ -156,6 +156,7 @@ def _report(command: str, result: cal.Calibration, pictures: Pictures, board: Bo
         "lenses": {one.kind: {"rms_px": one.rms, "parameters": len(one.names)} for one in (fit, result.other)},
         "better_lens": result.better,
         "coverage": [_coverage(c, result.views, pictures.size) for c in range(len(fit.lenses))],
+        "lens_unknown": list(result.unknown),
         "per_view": per_view,
         "not_found": pictures.missed(),
     }
@@ -198,6 +199,11 @@ def _report(command: str, result: cal.Calibration, pictures: Pictures, board: Bo
         warnings.append("views that stand out: " + ", ".join(result.views[k].names[0] for k in outliers))
     if min(numbers["coverage"]) < 0.4:
         warnings.append(f"the boards cover {100 * min(numbers['coverage']):.0f} % of the image only")
+    if max(result.unknown) > 0:
+        warnings.append(
+            f"the lens is known to worse than {cal.KNOWN:g} px in {100 * max(result.unknown):.0f} % of the image: "
+            "show the board there, or keep the marker where the boards were"
+        )
     if pictures.missed():
         warnings.append(f"no board found in {', '.join(pictures.missed())}")
     numbers["warnings"] = warnings

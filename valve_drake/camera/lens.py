@@ -8,15 +8,20 @@ The paper's eq. (1) leads from raw to ideal in closed form; `project`, its inver
 """
 
 import dataclasses as dc
+import math
 import pathlib
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeAlias
 
 import cv2
 import numpy as np
-import yaml
 
-from valve_drake.checks import ConfigError, require, require_in
+from valve_drake import outputs, yaml_file
+from valve_drake.checks import ConfigError, require, require_in, shown
 
+SigmaMap: TypeAlias = Sequence[Sequence[float]] | None  # rows from top to bottom, evenly over the image [px]
+
+_MOST_PX = 1e6  # of a focal length, and of the principal point's distance from the image
 _NEWTON_STEPS = 6  # quadratic: 1e-12 px after four steps for any lens that `check` lets pass
 
 
@@ -38,6 +43,12 @@ class LensModel(Protocol):
     def focal(self) -> float:
         """Pixels for one unit of xy near the image's centre (mean of both directions) [px]."""
 
+    def sigma(self, px: np.ndarray) -> np.ndarray:
+        """Standard deviation of where the lens puts a point seen at raw px (..., 2): (...,) [px]; 0 if not known.
+
+        It is that of the calibration: small where its boards were, large where they were not.
+        """
+
 
 @dc.dataclass(frozen=True)
 class Lens:
@@ -54,14 +65,18 @@ class Lens:
     v_0: float
     width: int = 640
     height: int = 480
+    sigma_px: SigmaMap = dc.field(default=None, compare=False, repr=False)
 
     def check(self, key: str = "lens") -> None:
         """Raises ConfigError unless eq. (1) can be inverted over the whole image."""
-        for name in ("k_u", "k_v", "k_x", "k_y", "u_0", "v_0"):
-            value = getattr(self, name)
-            ok = isinstance(value, int | float) and np.isfinite(value) and (value > 0 or name not in ("k_x", "k_y"))
-            require(ok, f"{key}.{name}", "a finite number, > 0 for k_x and k_y", value)
+        for name in ("k_u", "k_v"):
+            require(_is_number(getattr(self, name)), f"{key}.{name}", "a finite number", getattr(self, name))
+        for name in ("k_x", "k_y"):
+            require_in(getattr(self, name), 1.0, _MOST_PX, f"{key}.{name}")
+        for name in ("u_0", "v_0"):
+            require_in(getattr(self, name), -_MOST_PX, _MOST_PX, f"{key}.{name}")
         _check_size(self, key)
+        _check_sigma(self.sigma_px, key)
         du, dv = max(self.u_0, self.width - self.u_0), max(self.v_0, self.height - self.v_0)
         worst = 3 * min(self.k_u, self.k_v) * (du * du + dv * dv)
         require(worst > -0.9, f"{key}.k_u, k_v", "so small that the image does not fold back", (self.k_u, self.k_v))
@@ -102,6 +117,9 @@ class Lens:
     def focal(self) -> float:
         return float(np.sqrt(self.k_x * self.k_y))
 
+    def sigma(self, px: np.ndarray) -> np.ndarray:
+        return _sigma_at(self.sigma_px, self.width, self.height, px)
+
     def _from_axis(self, px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """u - u_0, v - v_0 and r^2 of eq. (1)."""
         px = np.asarray(px, float)
@@ -117,18 +135,46 @@ class OpenCvLens:
     dist: np.ndarray
     width: int = 640
     height: int = 480
+    sigma_px: SigmaMap = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", np.array(self.K, float).reshape(3, 3))
         object.__setattr__(self, "dist", np.array(self.dist, float).ravel())
 
     def check(self, key: str = "lens") -> None:
-        """Raises ConfigError for numbers that are no camera."""
-        ok = np.isfinite(self.K).all() and self.K[0, 0] > 0 and self.K[1, 1] > 0 and self.K[2, 2] == 1
-        require(bool(ok), f"{key}.K", "finite with positive focal lengths and K[2][2] = 1", self.K.tolist())
-        ok = np.isfinite(self.dist).all() and len(self.dist) in (0, 4, 5, 8, 12, 14)
-        require(bool(ok), f"{key}.dist", "4, 5, 8, 12 or 14 finite numbers", self.dist.tolist())
+        """Raises ConfigError for numbers that are no camera, or one that folds back inside its image."""
+        K, dist = self.K, self.dist
+        require(bool(np.isfinite(K).all()), f"{key}.K", "3 rows of 3 finite numbers", K.tolist())
+        require(K[0, 1] == 0 and K[1, 0] == 0, f"{key}.K", "without skew: K[0][1] = 0", K.tolist())
+        require(K[2].tolist() == [0, 0, 1], f"{key}.K", "with [0, 0, 1] as its last row", K.tolist())
+        focal = bool((np.diag(K)[:2] >= 1).all() and (np.diag(K)[:2] <= _MOST_PX).all())
+        require(focal, f"{key}.K", f"of focal lengths within 1 to {_MOST_PX:g} px", K.tolist())
+        require(bool((np.abs(K) <= _MOST_PX).all()), f"{key}.K", f"within {_MOST_PX:g}", K.tolist())
+        ok = np.isfinite(dist).all() and (np.abs(dist) <= 1e4).all() and len(dist) in (0, 4, 5, 8, 12, 14)
+        require(bool(ok), f"{key}.dist", "4, 5, 8, 12 or 14 finite numbers up to 10000", dist.tolist())
         _check_size(self, key)
+        _check_sigma(self.sigma_px, key)
+        reach, corner = self.radial_reach()
+        if reach < corner:
+            raise ConfigError(
+                f"{key}.dist: the lens folds back {reach:.0f} px from its centre, inside the image (its corner is "
+                f"{corner:.0f} px away), got {shown(dist.tolist())}"
+            )
+
+    def radial_reach(self) -> tuple[float, float]:
+        """How far from the centre the image's radius still grows with the angle of a ray, and the farthest corner [px].
+
+        Beyond it no ray, or another one, belongs to a pixel.
+        """
+        k1, k2, _, _, k3, k4, k5, k6 = np.append(self.dist, np.zeros(8))[:8] if len(self.dist) else np.zeros(8)
+        r = np.tan(np.linspace(0, math.radians(89.9), 4000))
+        rr = r * r
+        seen = r * (1 + rr * (k1 + rr * (k2 + rr * k3))) / (1 + rr * (k4 + rr * (k5 + rr * k6)))
+        falls = np.flatnonzero(~(np.diff(seen) > 0))
+        last = seen[falls[0]] if len(falls) else seen[-1]
+        center, f = self.K[:2, 2], np.diag(self.K)[:2]
+        farthest = np.maximum(np.abs(center), np.abs([self.width - 1, self.height - 1] - center))
+        return float(last * f.mean()), float(np.linalg.norm(farthest / f) * f.mean())
 
     def normalize(self, px: np.ndarray) -> np.ndarray:
         flat = np.ascontiguousarray(px, float).reshape(-1, 1, 2)
@@ -156,6 +202,9 @@ class OpenCvLens:
 
     def focal(self) -> float:
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    def sigma(self, px: np.ndarray) -> np.ndarray:
+        return _sigma_at(self.sigma_px, self.width, self.height, px)
 
 
 def distortion_maps(lens: LensModel, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -193,17 +242,34 @@ class StereoHead:
 
 def load_head(path: str | pathlib.Path) -> StereoHead:
     """Reads a head calibration (see `save_head`). Raises ConfigError naming the file and the key."""
-    data = read_yaml(path)
-    rms_px = data.pop("rms_px", 0.0)
-    _require_keys(data, {"left", "right", "X_LR"}, f"calibration {path}")
-    require_in(rms_px, 0.0, 1e6, f"calibration {path}: rms_px")
-    try:
-        X_LR = np.array(data["X_LR"], float)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"calibration {path}: X_LR must be 3 rows of 4 numbers") from error
-    require(X_LR.shape == (3, 4), f"calibration {path}: X_LR", "3 rows of 4 numbers", data["X_LR"])
-    lenses = [lens_from(data[side], f"calibration {path}: {side}") for side in ("left", "right")]
-    return StereoHead(lenses[0], lenses[1], X_LR, rms_px=float(rms_px))
+    key = f"calibration {path}"
+    data = yaml_file.read(path, source=key)
+    require(isinstance(data, dict), key, "a mapping with left, right and X_LR", data)
+    return head_from(data, key)
+
+
+def head_from(data: dict[str, Any], key: str) -> StereoHead:
+    """The head of a mapping as `save_head` writes it. Raises ConfigError naming `key`."""
+    _require_keys(data, {"left", "right", "X_LR"}, key, optional={"rms_px"})
+    rms_px = data.get("rms_px", 0.0)
+    require_in(rms_px, 0.0, 1000.0, f"{key}: rms_px")
+    rule = "3 rows of 4 finite numbers"
+    X_LR = data["X_LR"]
+    rows = isinstance(X_LR, list) and len(X_LR) == 3 and all(isinstance(row, list) and len(row) == 4 for row in X_LR)
+    require(rows and all(_is_number(value) for row in X_LR for value in row), f"{key}: X_LR", rule, X_LR)
+    lenses = [lens_from(data[side], f"{key}: {side}") for side in ("left", "right")]
+    head = StereoHead(lenses[0], lenses[1], np.array(X_LR, float), rms_px=float(rms_px))
+    check_baseline(head, f"{key}: X_LR")
+    return head
+
+
+def check_baseline(head: StereoHead, key: str) -> None:
+    """Raises ConfigError unless the cameras are two, side by side, with a distance in metres."""
+    p = head.X_LR[:, 3]
+    require(bool(1e-3 <= np.linalg.norm(p) <= 10), key, "of cameras 0.001 to 10 m apart", p.tolist())
+    if abs(p[1]) > abs(p[0]):
+        raise ConfigError(f"{key}: one camera is above the other, which is not supported: they must be side by side")
+    require(bool(p[0] > 0), key, "of a right camera on the right of the left one", p.tolist())
 
 
 def save_head(head: StereoHead, path: str | pathlib.Path, comment: str = "") -> None:
@@ -214,56 +280,74 @@ def save_head(head: StereoHead, path: str | pathlib.Path, comment: str = "") -> 
     write_yaml(data, path, comment)
 
 
-def read_yaml(path: str | pathlib.Path) -> dict[str, Any]:
-    """The mapping in a YAML file of a calibration. Raises ConfigError naming the file."""
-    try:
-        data = yaml.safe_load(pathlib.Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"calibration {path}: cannot be read ({error.__class__.__name__})") from error
-    except yaml.YAMLError as error:
-        line = f" at line {error.problem_mark.line + 1}" if getattr(error, "problem_mark", None) else ""
-        raise ConfigError(f"calibration {path}: not YAML{line}") from error
-    require(isinstance(data, dict), f"calibration {path}", "a mapping with left, right and X_LR", type(data).__name__)
-    return data
-
-
 def write_yaml(data: dict[str, Any], path: str | pathlib.Path, comment: str = "") -> None:
-    """Writes a mapping below lines of comment. Raises ConfigError naming the file."""
-    lines = "".join(f"# {line}\n" for line in comment.splitlines())
-    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)
-    try:
-        pathlib.Path(path).write_text(lines + text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.__class__.__name__})") from error
+    """Writes a mapping below lines of comment. Raises OperationFailed."""
+    outputs.write(path, yaml_file.dump(data, comment))
 
 
 def lens_from(data: Any, key: str) -> LensModel:
     """The lens of a mapping made by `lens_to`. Raises ConfigError naming `key`."""
     require(isinstance(data, dict), key, "a mapping", data)
     kind = OpenCvLens if "K" in data else Lens
-    _require_keys(data, {f.name for f in dc.fields(kind)}, key)
-    try:
-        lens = kind(**data)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{key}: {error}") from error
+    _require_keys(data, {f.name for f in dc.fields(kind)} - {"sigma_px"}, key, optional={"sigma_px"})
+    for name, rows in (("K", True), ("dist", False)) if kind is OpenCvLens else ():
+        value = data[name]
+        lists = [row for row in value if isinstance(row, list)] if isinstance(value, list) and rows else [value]
+        numbers = all(isinstance(row, list) and all(map(_is_number, row)) for row in lists)
+        shape = not rows or (isinstance(value, list) and [len(row) for row in lists] == [3] * 3 == [len(value)] * 3)
+        require(bool(numbers and shape), f"{key}.{name}", "3 rows of 3 numbers" if rows else "a list of numbers", value)
+    lens = kind(**data)
     lens.check(key)
     return lens
 
 
 def lens_to(lens: LensModel) -> dict[str, Any]:
     """The lens's fields as plain numbers and lists."""
-    values = dc.asdict(lens)
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+    values = {f.name: getattr(lens, f.name) for f in dc.fields(lens)}
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in values.items()
+        if value is not None
+    }
 
 
-def _require_keys(data: dict, names: set[str], key: str) -> None:
-    missing, unknown = sorted(names - set(data)), sorted(map(str, set(data) - names))
+def _require_keys(data: dict, names: set[str], key: str, optional: set[str] = frozenset()) -> None:
+    missing, unknown = sorted(names - set(data)), sorted(shown(n)[1:-1] for n in set(data) - names - optional)
     if missing or unknown:
-        parts = [f"lacks {', '.join(missing)}"] * bool(missing) + [f"has unknown {', '.join(unknown)}"] * bool(unknown)
+        parts = [f"lacks {', '.join(missing)}"] * bool(missing)
+        parts += [f"has unknown {', '.join(unknown[:6])}"] * bool(unknown)
         raise ConfigError(f"{key} {' and '.join(parts)}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 def _check_size(lens: LensModel, key: str) -> None:
     for name in ("width", "height"):
         value = getattr(lens, name)
-        require(isinstance(value, int) and 16 <= value <= 16384, f"{key}.{name}", "a whole number of 16..16384", value)
+        ok = isinstance(value, int) and not isinstance(value, bool) and 16 <= value <= 16384
+        require(ok, f"{key}.{name}", "a whole number of 16..16384", value)
+
+
+def _check_sigma(grid: SigmaMap, key: str) -> None:
+    if grid is None:
+        return
+    rows = isinstance(grid, list) and 2 <= len(grid) <= 64 and all(isinstance(row, list) for row in grid)
+    ok = rows and 2 <= len(grid[0]) <= 64 and all(len(row) == len(grid[0]) for row in grid)
+    ok = ok and all(_is_number(value) and 0 <= value <= _MOST_PX for row in grid for value in row)
+    require(ok, f"{key}.sigma_px", "2 to 64 rows of as many numbers >= 0", grid)
+
+
+def _sigma_at(grid: SigmaMap, width: int, height: int, px: np.ndarray) -> np.ndarray:
+    """Bilinear between the grid's points, which lie evenly over the image from corner to corner."""
+    px = np.asarray(px, float)
+    if grid is None:
+        return np.zeros(px.shape[:-1])
+    g = np.array(grid, float)
+    at = px / [width - 1, height - 1] * [g.shape[1] - 1, g.shape[0] - 1]
+    at = at.clip(0, [g.shape[1] - 1, g.shape[0] - 1])
+    low = np.minimum(at.astype(int), [g.shape[1] - 2, g.shape[0] - 2])
+    (x, y), (i, j) = np.moveaxis(at - low, -1, 0), np.moveaxis(low, -1, 0)
+    top = g[j, i] * (1 - x) + g[j, i + 1] * x
+    return top * (1 - y) + (g[j + 1, i] * (1 - x) + g[j + 1, i + 1] * x) * y

@@ -5,6 +5,7 @@ import json
 import math
 from pathlib import Path
 
+from valve_drake import outputs
 from valve_drake.checks import ConfigError
 from valve_drake.commands.common import OK, Parser, Subcommands
 
@@ -48,18 +49,29 @@ def command(options: argparse.Namespace) -> int:
             options.images, options.poses, board, options.out, options.camera, options.eye_to_hand, options.html
         )
     else:
+        _check_outputs(options)
         distances = None if options.distances is None else _millimetres(options.distances)
         if options.kind == "stereo":
             report = reports.stereo(options.left, options.right, board, options.out, options.lens, distances)
         else:
             report = reports.intrinsics(options.images, board, options.out, options.lens, distances)
-    if options.html and options.kind != "hand-eye":
-        try:
-            options.html.write_text(report.page, encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"--html {options.html}: cannot be written ({type(error).__name__})") from error
+        if options.html:
+            outputs.write(options.html, report.page)
     print(json.dumps(report.numbers) if options.json else "\n".join(report.lines()))
     return OK
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Refuses, before the work, files that must not be written over. Raises ConfigError."""
+    from valve_drake.camera.board import find_images
+    from valve_drake.camera.calibration_file import is_own
+    from valve_drake.camera.calibration_page import is_page
+
+    keys = ("left", "right") if options.kind == "stereo" else ("images",)
+    inputs = [path for key in keys for path in find_images(getattr(options, key), f"--{key}")]
+    outputs.check(options.out, "--out", inputs, made_before=is_own)
+    if options.html:
+        outputs.check(options.html, "--html", [*inputs, options.out], made_before=is_page)
 
 
 def _millimetres(text: str) -> list[float]:

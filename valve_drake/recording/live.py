@@ -50,8 +50,7 @@ class LiveView:
                 context=self._context,
             )
         except (RuntimeError, OSError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ConfigError(f"--live cannot serve on {host}:{port}: {reason}") from None
+            raise ConfigError(f"--live cannot serve on {host}:{port}: {error}") from None
 
     @property
     def port(self) -> int:

@@ -97,10 +97,9 @@ class LogWriter:
         channel.count += 1
 
     def write_metadata(self, name: str, facts: Mapping[str, str]) -> None:
-        """Adds a metadata record and flushes. What is not UTF-8, of a file's name, is written as \\udcXX."""
+        """Adds a metadata record and flushes."""
         self._close_chunk()
-        facts = {key: value.encode("utf-8", "backslashreplace").decode() for key, value in facts.items()}
-        self._hand_over(0, self._mcap.add_metadata, name, facts)
+        self._hand_over(0, self._mcap.add_metadata, name, dict(facts))
         self.flush()
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
