@@ -18,9 +18,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
-from valve_drake import frames, resources
+from valve_drake import frames, resources, yaml_file
 from valve_drake.analysis import hand_eye_experiment
 from valve_drake.analysis.drawn_images import GREEN, METAL, PLATE, RED, WALL, Canvas, draw_bar, draw_board
 from valve_drake.camera.lens import StereoHead, load_head
@@ -51,7 +50,7 @@ def paper_tables() -> dict[str, Any]:
         u, _, v = np.linalg.svd(T[:, :3])
         return frames.make(u @ v, T[:, 3] / 1000)
 
-    data = yaml.safe_load(Path(__file__).with_name("paper_tables.yaml").read_text(encoding="utf-8"))
+    data = yaml_file.read(Path(__file__).with_name("paper_tables.yaml"))
     return {
         "T_m": rigid(data["eq_26_T_m"]),
         "table_2": [{name: rigid(rows) for name, rows in sample.items()} for sample in data["table_2"]],

@@ -14,9 +14,9 @@ from typing import Any
 
 import jinja2
 import numpy as np
-import yaml
 from markupsafe import Markup
 
+from valve_drake import yaml_file
 from valve_drake.analysis import two_logs
 from valve_drake.analysis.comparison import Divergence
 from valve_drake.analysis.curves import make_plots, overlaid
@@ -25,6 +25,7 @@ from valve_drake.analysis.metrics import Summary, summarize
 from valve_drake.analysis.pictures import Album, Moment
 from valve_drake.analysis.plots import LEFT, RIGHT, WIDTH, Plot, mode_class, nice_ticks
 from valve_drake.analysis.traces import MOST, ModeSpan, Traces
+from valve_drake.checks import ConfigError
 from valve_drake.messages import Mode
 from valve_drake.pace import PACE, Pace
 from valve_drake.recording.container import LIBRARY
@@ -432,8 +433,8 @@ def _log_lines(log: LogReader) -> list[tuple[float, str, str, int]]:
 
 def _parsed(text: str) -> dict[str, Any]:
     try:
-        out = yaml.safe_load(text)
-    except yaml.YAMLError:
+        out = yaml_file.parse(text, "scenario")
+    except ConfigError:
         return {}
     return out if isinstance(out, dict) else {}
 
