@@ -23,6 +23,7 @@ from pydrake.geometry import (
     MakeRenderEngineVtk,
     RenderCameraCore,
     RenderEngineVtkParams,
+    SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
@@ -31,12 +32,15 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo
 
 from valve_drake.camera.lens import Lens, distortion_maps
+from valve_drake.frames import compose, make, rot_z
 from valve_drake.messages import CameraFrame
 from valve_drake.ports import profile
+from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.simulation_config import CameraConfig, LightConfig, ValveConfig
 
-MARGIN = 26  # rendered beyond the image on every side: Table 1's lenses reach 23 px outward at the corners [px]
+ROLL = 0.17  # of the render against the image; edges at this angle are known to a row of the render only [rad]
+MAP_BLUR = 0.4  # standard deviation of what the bilinear map blurs [px]
 
 
 @dc.dataclass(frozen=True)
@@ -49,25 +53,30 @@ class Mount:
 
 
 class _Lensed:
-    """From an ideal rendered image to the raw image of one lens."""
+    """From an ideal rendered image to the raw image of one lens.
 
-    def __init__(self, lens: Lens, supersample: int):
-        m, k = MARGIN, supersample
-        self.width, self.height = (lens.width + 2 * m) * k, (lens.height + 2 * m) * k
-        # Ideal pixel of the render in OpenCV's convention: u = fx x' + cx. Scaling by k keeps pixel edges, not centres.
-        fx, fy = lens.k_x * k, lens.k_y * k
-        cx, cy = (lens.u_0 + m + 0.5) * k - 0.5, (lens.v_0 + m + 0.5) * k - 0.5
-        self.info = CameraInfo(self.width, self.height, fx, fy, cx + 0.5, cy + 0.5)
-        # Maps into the render reduced to normal size.
-        reduced = np.array([[lens.k_x, 0, lens.u_0 + m], [0, lens.k_y, lens.v_0 + m], [0, 0, 1]])
-        self.map_u, self.map_v = distortion_maps(lens, reduced)
-        self.supersample = k
-        self.reduced = (self.width // k, self.height // k)
+    The render's camera is turned about the optical axis by ROLL. A renderer asks at points what is there, so that an
+    edge along a row of them is known to the row only; but level and upright edges, that a room is full of, cross many
+    rows of a turned render, and the lens's map, which looks up every pixel in it anyway, turns them back. The map is
+    bilinear: its weights for a point of the render sum to one over the image, so that no edge is moved.
+    """
+
+    def __init__(self, lens: Lens):
+        x, y = distortion_maps(lens, np.eye(3))  # the ray of every pixel: x/z and y/z
+        c, s = np.cos(ROLL), np.sin(ROLL)
+        self.X_CR = make(rot_z(ROLL), np.zeros(3))  # the render's camera in the image's
+        focal = max(lens.k_x, lens.k_y)
+        u, v = focal * (c * x + s * y), focal * (c * y - s * x)
+        u0, v0 = np.floor(u.min()) - 1, np.floor(v.min()) - 1
+        width, height = int(np.ceil(u.max()) + 2 - u0), int(np.ceil(v.max()) + 2 - v0)
+        # In OpenCV's convention the principal point is at (-u0, -v0); Drake's is half a pixel on.
+        self.info = CameraInfo(width, height, focal, focal, 0.5 - u0, 0.5 - v0)
+        maps = ((u - u0).astype(np.float32), (v - v0).astype(np.float32))
+        self._maps = cv2.convertMaps(*maps, cv2.CV_16SC2)  # fixed-point, as remap computes in any case: 1/32 px
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        if self.supersample > 1:
-            image = cv2.resize(image, self.reduced, interpolation=cv2.INTER_AREA)
-        return cv2.remap(image, self.map_u, self.map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        """RGBA as rendered -> (H, W, 3) RGB."""
+        return cv2.cvtColor(cv2.remap(image, *self._maps, cv2.INTER_LINEAR), cv2.COLOR_RGBA2RGB)
 
 
 def lights(config: LightConfig) -> list[LightParameter]:
@@ -82,6 +91,23 @@ def lights(config: LightConfig) -> list[LightParameter]:
         side = [np.cos(angle), np.sin(angle), -0.6]
         out.append(LightParameter(type="directional", direction=side, frame="world", intensity=config.fill * k))
     return out if config.fill > 0 else out[:2]
+
+
+RENDERER = "cameras"  # its name in the rig's SceneGraph
+BACKGROUND = (0.80, 0.85, 0.90)
+
+
+def _add_vtk(scene_graph: SceneGraph, lights: list[LightParameter], supersample: int) -> None:
+    params = RenderEngineVtkParams(lights=lights, default_clear_color=np.array(BACKGROUND))
+    scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(params))
+
+
+def _add_egl(scene_graph: SceneGraph, lights: list[LightParameter], supersample: int) -> None:
+    engine = RenderEngineEgl(lights, BACKGROUND, supersample=supersample)
+    add_renderer(scene_graph, RENDERER, engine)
+
+
+RENDERERS = {"egl": _add_egl, "vtk": _add_vtk}  # scenario key simulation.camera.renderer
 
 
 class CameraRig:
@@ -99,22 +125,23 @@ class CameraRig:
         builder = DiagramBuilder()
         self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1.0)
         scene_graph.set_name("scene_graph")
-        params = RenderEngineVtkParams(lights=lights(light), default_clear_color=np.array([0.80, 0.85, 0.90]))
-        scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(params))
         self.scene = add_scene(self.plant, valve, marker_size)
         self.plant.Finalize()
+        RENDERERS[camera.renderer](scene_graph, lights(light), camera.supersample)
         self._scene_graph = scene_graph
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
         self._plant_context = self.plant.GetMyMutableContextFromRoot(self._context)
         self._query = scene_graph.get_query_output_port()
         self._camera = camera
-        self._gains = np.array([light.red_gain, 1.0, light.blue_gain])
+        gains = np.array([light.red_gain, 1.0, light.blue_gain])
+        levels = np.clip(np.arange(256)[:, None] * gains, 0, 255)
+        self._white_balance = np.rint(levels).astype(np.uint8)[None]  # (1, 256, 3), a table
         self._seed = seed
-        self._noise = _noise_pool(seed)
+        self._noise = _noise_pool(seed, camera.noise)
         self._mounts = dict(mounts)
         self._names = sorted(mounts)
-        self._lensed = {name: _Lensed(mount.lens, camera.supersample) for name, mount in mounts.items()}
+        self._lensed = {name: _Lensed(mount.lens) for name, mount in mounts.items()}
 
     def pose(self, q: np.ndarray) -> None:
         """Poses the renderer's own scene as it was at capture time; the running plant is not touched."""
@@ -122,50 +149,50 @@ class CameraRig:
 
     def _render(self, frame: Frame, X_FC: np.ndarray, info: CameraInfo) -> np.ndarray:
         X = frame.GetFixedPoseInBodyFrame() @ RigidTransform(RotationMatrix(X_FC[:, :3]), X_FC[:, 3])
-        core = RenderCameraCore("vtk", info, ClippingRange(0.02, 25.0), RigidTransform())
+        core = RenderCameraCore(RENDERER, info, ClippingRange(0.02, 25.0), RigidTransform())
         query = self._query.Eval(self._scene_graph.GetMyContextFromRoot(self._context))
         parent = self.plant.GetBodyFrameIdOrThrow(frame.body().index())
-        image = query.RenderColorImage(ColorRenderCamera(core, False), parent, X)
-        return np.ascontiguousarray(image.data[..., :3])
+        return query.RenderColorImage(ColorRenderCamera(core, False), parent, X).data
 
     def ideal(self, name: str, q: np.ndarray) -> np.ndarray:
         """The raw image of one camera without noise (H, W, 3) uint8."""
         mount, lensed = self._mounts[name], self._lensed[name]
         self.pose(q)
-        return lensed(self._render(self.plant.GetFrameByName(mount.frame), mount.X_FC, lensed.info))
+        X_FR = compose(mount.X_FC, lensed.X_CR)
+        return lensed(self._render(self.plant.GetFrameByName(mount.frame), X_FR, lensed.info))
+
+    def optical(self, name: str, q: np.ndarray) -> np.ndarray:
+        """The same with the blur of its optics: what falls on the sensor."""
+        image, blur = self.ideal(name, q), self._camera.blur
+        return cv2.GaussianBlur(image, (0, 0), float(np.sqrt(blur**2 - MAP_BLUR**2))) if blur > MAP_BLUR else image
 
     def captured(self, name: str, capture: "Capture") -> None:
         """Nothing to do ahead: images are made where they are read."""
 
     def frame(self, name: str, capture: "Capture") -> CameraFrame:
         """What the camera delivers: lens, blur, white balance, noise, JPEG and back."""
-        image = self.ideal(name, capture.q)
-        c = self._camera
-        if c.blur > 0:
-            image = cv2.GaussianBlur(image, (0, 0), c.blur)
+        image = self.optical(name, capture.q)
         rng = np.random.Generator(np.random.SFC64([self._seed, self._names.index(name), capture.sequence]))
         start = int(rng.integers(len(self._noise) - image.size))
         noise = self._noise[start : start + image.size].reshape(image.shape)
-        values = cv2.multiply(image, (*self._gains, 0.0), dtype=cv2.CV_32F)
-        values = cv2.scaleAdd(noise, c.noise, values)
-        return encode_frame(
-            name, capture.time, capture.sequence, cv2.convertScaleAbs(cv2.max(values, 0.0)), c.jpeg_quality
-        )
+        image = cv2.add(cv2.LUT(image, self._white_balance), noise, dtype=cv2.CV_8U)  # saturates
+        return encode_frame(name, capture.time, capture.sequence, image, self._camera.jpeg_quality)
 
     def view(self, X_WC: np.ndarray, q: np.ndarray, width: int, height: int, fov_y: float) -> np.ndarray:
         """A picture from anywhere, for people (height, width, 3)."""
         self.pose(q)
         focal = height / 2 / np.tan(fov_y / 2)
         info = CameraInfo(width, height, focal, focal, width / 2, height / 2)
-        return self._render(self.plant.world_frame(), X_WC, info)
+        return np.ascontiguousarray(self._render(self.plant.world_frame(), X_WC, info)[..., :3])
 
 
-def _noise_pool(seed: int) -> np.ndarray:
-    """White noise of unit deviation, several images' worth: every image takes a stretch of it from a place of its own.
+def _noise_pool(seed: int, deviation: float) -> np.ndarray:
+    """White noise in grey levels (int16), several images' worth: every image takes a stretch from a place of its own.
 
-    Drawing a million numbers anew for each image would cost as much as a third of its rendering.
+    Drawing a million numbers anew for each image would cost as much as its rendering.
     """
-    return np.random.Generator(np.random.SFC64([seed, 99])).standard_normal(4 << 20, dtype=np.float32)
+    noise = np.random.Generator(np.random.SFC64([seed, 99])).standard_normal(4 << 20, dtype=np.float32)
+    return np.rint(deviation * noise).astype(np.int16)
 
 
 def encode_frame(camera: str, time: float, sequence: int, image: np.ndarray, quality: int) -> CameraFrame:

@@ -4,7 +4,7 @@ import dataclasses as dc
 import math
 
 from valve_drake.checks import require
-from valve_drake.config import Config, Number, number, plain
+from valve_drake.config import Config, Number, choice, number, plain
 from valve_drake.ports import TICK
 
 
@@ -56,7 +56,9 @@ class CameraConfig(Config):
 
     KEY = "simulation.camera"
     noise: Number = number(2.0, 0.0, 20.0, "standard deviation of a pixel [grey levels]")
-    blur: Number = number(0.5, 0.0, 5.0, "standard deviation of the optical blur [px]")
+    blur: Number = number(
+        0.5, 0.0, 5.0, "standard deviation of the optical blur; what the lens's map blurs, 0.4, is the least [px]"
+    )
     head_period: float = number(0.125, 1 / 32, 2.0, "between two captures of a head camera [s]")
     wrist_period: float = number(0.0625, 1 / 32, 2.0, "between two captures of a wrist camera [s]")
     latency: float = number(
@@ -64,7 +66,8 @@ class CameraConfig(Config):
     )
     wrist_focal: Number = number(480.0, 200.0, 900.0, "[px]")
     jpeg_quality: int = number(95, 50, 100, "of JPEG")
-    supersample: int = number(1, 1, 4, "2: rendered at twice the size and averaged")
+    renderer: str = choice("egl", ("egl", "vtk"), "egl: this program's own (render_egl.py); vtk: Drake's, slower")
+    supersample: int = number(2, 1, 4, "of egl: a pixel is the mean of so many points a side; vtk has four points")
 
     def relations(self, key: str) -> None:
         for name in ("head_period", "wrist_period", "latency"):

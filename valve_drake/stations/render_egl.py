@@ -1,0 +1,485 @@
+"""A Drake RenderEngine for machines without a GPU or a display: the whole scene in one vertex buffer and one draw call.
+
+    add_renderer(scene_graph, "egl", RenderEngineEgl(lights=[...]))  # after the plant's Finalize
+
+draws colour images by OpenGL on EGL (in Mesa's llvmpipe, where there is no GPU) three to eight times faster than
+RenderEngineVtk, which issues a draw call for each geometry and shades each sample of each pixel. A pixel is the mean of
+what it covers (`supersample` squared points of it). Left out: depth and label images, textures, specular light,
+transparency, shadows, meshes other than OBJ. See docs/renderer.md.
+
+Lengths [m]. Colours linear as in Drake, no gamma.
+"""
+
+import ctypes
+import dataclasses as dc
+import functools
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import moderngl
+import numpy as np
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    ColorRenderCamera,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    GeometryId,
+    LightParameter,
+    Mesh,
+    PerceptionProperties,
+    RenderEngine,
+    Rgba,
+    Role,
+    SceneGraph,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+
+SEGMENTS = 48  # of round shapes, as in RenderEngineVtk; raise it where a rim looks angular
+MAX_LIGHTS = 4
+
+_VERTEX_SHADER = """
+#version 330
+uniform sampler2D poses;   // row g: the four columns of X_CG, C the camera: x right, y down, z forward
+uniform vec4 projection;   // clip x = p.x x + p.y z, clip y = p.z y + p.w z
+uniform vec2 range;        // near, far
+uniform int light_count;
+uniform vec4 lights[4];    // in C: direction towards the light, or its position (w = 1)
+uniform float intensities[4];
+in vec3 position;
+in vec3 normal;
+in vec3 color;
+in int geometry;
+out vec3 shade;
+void main() {
+    mat4 X = mat4(texelFetch(poses, ivec2(0, geometry), 0), texelFetch(poses, ivec2(1, geometry), 0),
+                  texelFetch(poses, ivec2(2, geometry), 0), texelFetch(poses, ivec2(3, geometry), 0));
+    vec3 p = (X * vec4(position, 1.0)).xyz;
+    vec3 n = mat3(X) * normal;
+    if (dot(n, p) > 0.0) n = -n;  // both sides of a surface are lit
+    float sum = 0.0;
+    for (int k = 0; k < light_count; ++k) {
+        vec3 to_light = lights[k].w > 0.5 ? normalize(lights[k].xyz - p) : lights[k].xyz;
+        sum += intensities[k] * max(dot(n, to_light), 0.0);
+    }
+    shade = color * sum;
+    gl_Position = vec4(projection.x * p.x + projection.y * p.z, projection.z * p.y + projection.w * p.z,
+                       (p.z * (range.y + range.x) - 2.0 * range.x * range.y) / (range.y - range.x), p.z);
+}
+"""
+_FRAGMENT_SHADER = """
+#version 330
+in vec3 shade;
+out vec4 pixel;
+void main() { pixel = vec4(shade, 1.0); }
+"""
+
+
+@dc.dataclass(frozen=True)
+class Triangles:
+    """A surface in its geometry's frame, three rows a triangle, counterclockwise seen from outside.
+
+    points, normals, colors: (3n, 3), float32.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+
+
+class RenderEngineEgl(RenderEngine):
+    """Colour images of all perception geometry, shaded by vertices (Gouraud) with diffuse light.
+
+    lights: directional or point lights without attenuation, at most four, fixed in the world or in the camera; none
+    is Drake's default, one at the camera. default_clear_color: of the background. default_diffuse: of geometry without
+    ("phong", "diffuse"). supersample: points of a pixel along each side, 1 to 4; raise it where edges are to be
+    smoother, its square is paid for. cull: leave out triangles that are seen from behind, which closed surfaces never
+    show.
+
+    Raises ValueError for a light that it cannot make; RuntimeError from the first image where EGL is missing.
+    """
+
+    def __init__(
+        self,
+        lights: Sequence[LightParameter] = (),
+        default_clear_color: Sequence[float] = (204 / 255, 229 / 255, 255 / 255),
+        default_diffuse: Sequence[float] = (0.9, 0.7, 0.2, 1.0),
+        supersample: int = 2,
+        cull: bool = True,
+    ):
+        RenderEngine.__init__(self)
+        if supersample not in (1, 2, 3, 4):
+            raise ValueError(f"supersample must be 1, 2, 3 or 4, got {supersample}")
+        lights = list(lights) or [LightParameter(type="directional", direction=[0, 0, 1], frame="camera")]
+        if len(lights) > MAX_LIGHTS:
+            raise ValueError(f"lights must be at most {MAX_LIGHTS}, got {len(lights)}")
+        for light in lights:
+            if light.type not in ("directional", "point") or light.frame not in ("world", "camera"):
+                raise ValueError(f"a light must be directional or point, in world or camera, got {light}")
+        self._settings = (lights, tuple(default_clear_color), tuple(default_diffuse), supersample, cull)
+        self._lights, self._clear, self._diffuse, self._supersample, self._cull = self._settings
+        self._X_WC = RigidTransform()
+        self._surfaces: dict[GeometryId, Triangles] = {}
+        self._rows: dict[GeometryId, int] = {}  # of self._poses
+        self._poses = np.zeros((0, 4, 4), np.float32)  # X_WG
+        self._on_stage: _Stage | None = None  # the surfaces as OpenGL has them; shared by clones
+
+    # ------------------------------------------------------------ RenderEngine's own interface
+    # Drake's binding forbids to keep the arguments of these: what is needed is read off at once.
+
+    def UpdateViewpoint(self, X_WC: RigidTransform) -> None:
+        self._X_WC = RigidTransform(X_WC)
+
+    def DoRegisterVisual(
+        self, id: GeometryId, shape: Shape, properties: PerceptionProperties, X_WG: RigidTransform
+    ) -> bool:
+        if id in self._rows:  # a clone's, see DoClone
+            return True
+        color = properties.GetPropertyOrDefault("phong", "diffuse", Rgba(*self._diffuse))
+        if color.a() <= 0.0:
+            return False
+        surface = _surface(shape, (color.r(), color.g(), color.b()))
+        if surface is None:
+            return False
+        self._surfaces = {**self._surfaces, id: surface}
+        self._rows = {**self._rows, id: len(self._poses)}
+        self._poses = np.concatenate([self._poses, X_WG.GetAsMatrix4()[None].astype(np.float32)])
+        self._on_stage = None
+        return True
+
+    def DoUpdateVisualPose(self, id: GeometryId, X_WG: RigidTransform) -> None:
+        self._poses[self._rows[id]] = X_WG.GetAsMatrix4()
+
+    def DoRemoveGeometry(self, id: GeometryId) -> bool:
+        if id not in self._surfaces:
+            return False
+        kept = [other for other in self._rows if other != id]
+        self._poses = self._poses[[self._rows[other] for other in kept]]
+        self._rows = {other: k for k, other in enumerate(kept)}
+        self._surfaces = {other: self._surfaces[other] for other in kept}
+        self._on_stage = None
+        return True
+
+    def DoClone(self) -> "RenderEngineEgl":
+        clone = RenderEngineEgl(*self._settings)
+        clone._X_WC = RigidTransform(self._X_WC)
+        clone._surfaces, clone._rows, clone._poses = self._surfaces, self._rows, self._poses.copy()
+        clone._on_stage = self._on_stage
+        # Which poses Drake tells an engine of is in its C++ part, that Python cannot copy: it is told once more.
+        for id in self._rows:
+            clone.RegisterVisual(id, Sphere(1.0), PerceptionProperties(), RigidTransform(), needs_updates=True)
+        return clone
+
+    def DoRenderColorImage(self, camera: ColorRenderCamera, color_image_out: Any) -> None:
+        gl = _open()
+        if self._on_stage is None or self._on_stage.gl is not gl:
+            self._on_stage = _Stage(gl, [self._surfaces[id] for id in self._rows])
+        core = camera.core()
+        X_CW = self._X_WC.inverse()
+        uniforms = _light_uniforms(self._lights, X_CW)
+        info, clipping = core.intrinsics(), core.clipping()
+        width, height = info.width(), info.height()
+        # OpenGL's first row is the lowest; here it is the first of the image, so that nothing has to be turned over.
+        uniforms["projection"] = (
+            2 * info.focal_x() / width,
+            2 * info.center_x() / width - 1,
+            2 * info.focal_y() / height,
+            2 * info.center_y() / height - 1,
+        )
+        uniforms["range"] = (clipping.near(), clipping.far())
+        poses = X_CW.GetAsMatrix4().astype(np.float32) @ self._poses
+        k = self._supersample
+        image = self._on_stage.draw(width * k, height * k, poses, uniforms, self._clear, self._cull)
+        out = color_image_out.mutable_data
+        if k == 1:
+            out[...] = image
+        else:
+            cv2.resize(image, (width, height), dst=out, interpolation=cv2.INTER_AREA)
+
+
+def add_renderer(scene_graph: SceneGraph, name: str, engine: RenderEngine) -> None:
+    """`scene_graph.AddRenderer(name, engine)` for an engine written in Python; what is registered later is not drawn.
+
+    Drake 1.51's binding hands a shape to Python only if Python holds that very object already (1.58's always does), so
+    all are held for the length of the call.
+    """
+    inspector = scene_graph.model_inspector()
+    held = []
+    for id in inspector.GetAllGeometryIds(Role.kPerception):
+        held += [inspector.GetShape(id), inspector.GetPerceptionProperties(id)]
+    scene_graph.AddRenderer(name, engine)
+
+
+def _light_uniforms(lights: Sequence[LightParameter], X_CW: RigidTransform) -> dict[str, Any]:
+    rows = np.zeros((MAX_LIGHTS, 4), np.float32)
+    intensities = np.zeros(MAX_LIGHTS, np.float32)
+    for k, light in enumerate(lights):
+        in_world = light.frame == "world"
+        if light.type == "point":
+            position = np.array(light.position, float)
+            rows[k] = (*(X_CW.multiply(position) if in_world else position), 1.0)
+        else:
+            direction = np.array(light.direction, float)
+            direction = direction / np.linalg.norm(direction)
+            rows[k, :3] = -(X_CW.rotation().multiply(direction) if in_world else direction)
+        intensities[k] = light.intensity
+    return {"light_count": len(lights), "lights": rows.tobytes(), "intensities": intensities.tobytes()}
+
+
+# ---------------------------------------------------------------- OpenGL
+
+
+class _OpenGL:
+    """An OpenGL context of this process, its program, and the images that it has drawn into."""
+
+    def __init__(self) -> None:
+        try:
+            self.context = moderngl.create_context(standalone=True, backend="egl", require=330)
+            self._egl = ctypes.CDLL("libEGL.so.1")
+            self._egl.eglGetCurrentContext.restype = ctypes.c_void_p
+            with self.context:
+                self.program = self.context.program(vertex_shader=_VERTEX_SHADER, fragment_shader=_FRAGMENT_SHADER)
+        except Exception as error:
+            raise RuntimeError(f"no OpenGL 3.3 by EGL: {error}") from error
+        self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
+
+    def alive(self) -> bool:
+        """Whether it can be made current.
+
+        When Drake's VTK renderer is deleted, it ends EGL's display, and with it every context of this process.
+        """
+        with self.context:
+            return bool(self._egl.eglGetCurrentContext())
+
+    def target(self, width: int, height: int) -> moderngl.Framebuffer:
+        size = (width, height)
+        if size not in self._targets:
+            color, depth = self.context.renderbuffer(size, 4), self.context.depth_renderbuffer(size)
+            self._targets[size] = self.context.framebuffer(color, depth)
+        return self._targets[size]
+
+
+_opened: list[_OpenGL] = []  # the newest last: an engine shares it with all others
+
+
+def _open() -> _OpenGL:
+    """The process's OpenGL: to open one takes longer than an image."""
+    if not _opened or not _opened[-1].alive():
+        _opened.append(_OpenGL())
+    return _opened[-1]
+
+
+class _Stage:
+    """Surfaces in OpenGL's memory, row k of the poses belonging to surface k."""
+
+    def __init__(self, gl: _OpenGL, surfaces: Sequence[Triangles]):
+        self.gl = gl
+        kind = np.dtype([("position", "3f4"), ("normal", "3f4"), ("color", "3f4"), ("geometry", "i4")])
+        corners = np.zeros(sum(len(s.points) for s in surfaces), kind)
+        start = 0
+        for k, s in enumerate(surfaces):
+            part = corners[start : start + len(s.points)]
+            part["position"], part["normal"], part["color"], part["geometry"] = s.points, s.normals, s.colors, k
+            start += len(part)
+        # Corners that several triangles share are shaded once.
+        shared, order = np.unique(corners.view([("bytes", f"V{kind.itemsize}")]), return_inverse=True)
+        with gl.context as context:
+            layout = ("3f 3f 3f 1i", "position", "normal", "color", "geometry")
+            self._vertices = None
+            if len(corners):
+                buffer, indices = context.buffer(shared.tobytes()), context.buffer(order.astype(np.int32).tobytes())
+                self._vertices = context.vertex_array(gl.program, [(buffer, *layout)], indices)
+            self._poses = context.texture((4, max(len(surfaces), 1)), 4, dtype="f4")
+
+    def draw(
+        self,
+        width: int,
+        height: int,
+        poses: np.ndarray,
+        uniforms: dict[str, Any],
+        clear: Sequence[float],
+        cull: bool,
+    ) -> np.ndarray:
+        """An image (height, width, 4) uint8 RGBA, to be copied before the next is drawn. poses: X_CG (n, 4, 4)."""
+        with self.gl.context as context:
+            program, target = self.gl.program, self.gl.target(width, height)
+            target.use()
+            target.clear(*clear[:3], 1.0)
+            if self._vertices is not None:
+                context.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if cull else 0))
+                context.front_face = "cw"  # seen in the image's own orientation: its rows run downwards
+                self._poses.write(np.ascontiguousarray(poses.transpose(0, 2, 1)).tobytes())
+                self._poses.use(0)
+                for name, value in uniforms.items():
+                    if isinstance(value, bytes):
+                        program[name].write(value)
+                    else:
+                        program[name].value = value
+                self._vertices.render(moderngl.TRIANGLES)
+            data = target.read(components=4)
+        return np.frombuffer(data, np.uint8).reshape(height, width, 4)
+
+
+# ---------------------------------------------------------------- surfaces
+
+
+def _surface(shape: Shape, color: Sequence[float]) -> Triangles | None:
+    """A shape as triangles; None for one that cannot be drawn (a half space, a mesh that is no OBJ)."""
+    if isinstance(shape, Box):
+        points, normals = _box(shape.size())
+    elif isinstance(shape, Cylinder):
+        points, normals = _turned(_cylinder_profile(shape.radius(), shape.length()))
+    elif isinstance(shape, Sphere):
+        points, normals = _turned(_capsule_profile(shape.radius(), 0.0))
+    elif isinstance(shape, Capsule):
+        points, normals = _turned(_capsule_profile(shape.radius(), shape.length()))
+    elif isinstance(shape, Ellipsoid):
+        axes = np.array([shape.a(), shape.b(), shape.c()])
+        points, normals = _turned(_capsule_profile(1.0, 0.0))
+        points, normals = points * axes, normals / axes
+    elif isinstance(shape, Mesh | Convex):
+        path = shape.source().path() if shape.source().is_path() else None
+        if path is None or Path(path).suffix.lower() != ".obj":
+            return None
+        scale = np.array(shape.scale3())
+        points, normals, colors = read_obj(str(path), os.path.getmtime(path))
+        points, normals = points * scale, normals / scale
+        if np.prod(scale) < 0:
+            points, normals, colors = (_backwards(part) for part in (points, normals, colors))
+        colors = np.where(np.isnan(colors), np.array(color), colors)
+        return _triangles(points, normals, colors)
+    else:
+        return None
+    return _triangles(points, normals, np.tile(color, (len(points), 1)))
+
+
+def _triangles(points: np.ndarray, normals: np.ndarray, colors: np.ndarray) -> Triangles:
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return Triangles(*(np.ascontiguousarray(part, np.float32) for part in (points, normals, colors)))
+
+
+def _backwards(corners: np.ndarray) -> np.ndarray:
+    """Every triangle the other way round: a mirrored one would be seen from inside."""
+    return corners.reshape(-1, 3, 3)[:, ::-1].reshape(-1, 3)
+
+
+def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    points, normals = [], []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            n, u = np.zeros(3), np.zeros(3)
+            n[axis], u[(axis + 1) % 3] = sign, 1.0
+            v = np.cross(n, u)
+            corners = [n - u - v, n + u - v, n + u + v, n - u + v]
+            points += [corners[k] for k in (0, 1, 2, 0, 2, 3)]
+            normals += [n] * 6
+    return np.array(points) * np.asarray(size) / 2, np.array(normals)
+
+
+def _cylinder_profile(radius: float, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Pieces of the outline (r, z) from the lower pole to the upper one, each with its normals (r, z)."""
+    h = length / 2
+    down, out, up = np.array([[0.0, -1]] * 2), np.array([[1.0, 0]] * 2), np.array([[0.0, 1]] * 2)
+    return [
+        (np.array([[0, -h], [radius, -h]]), down),
+        (np.array([[radius, -h], [radius, h]]), out),
+        (np.array([[radius, h], [0, h]]), up),
+    ]
+
+
+def _capsule_profile(radius: float, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    angles = np.linspace(-np.pi / 2, np.pi / 2, SEGMENTS // 2 + 1)
+    normals = np.column_stack([np.cos(angles), np.sin(angles)])
+    points = radius * normals
+    points[:, 1] += np.where(angles < 0, -length / 2, length / 2)
+    if length > 0:  # the straight part between the two halves
+        middle = SEGMENTS // 4
+        points = np.insert(points, middle, [radius, -length / 2], axis=0)
+        normals = np.insert(normals, middle, [1.0, 0.0], axis=0)
+    return [(points, normals)]
+
+
+def _turned(profile: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """An outline turned about z: points and normals of its triangles, three rows each."""
+    angles = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
+    turn = np.column_stack([np.cos(angles), np.sin(angles)])
+
+    def around(rows: np.ndarray) -> np.ndarray:  # (m, 2) -> (m, SEGMENTS + 1, 3)
+        out = np.empty((len(rows), len(turn), 3))
+        out[..., :2] = rows[:, None, :1] * turn
+        out[..., 2] = rows[:, None, 1]
+        return out
+
+    points, normals = [], []
+    for rows, directions in profile:
+        for grid, into in ((around(rows), points), (around(directions), normals)):
+            a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
+            into.append(np.stack([a, b, c, a, c, d], axis=2).reshape(-1, 3))
+    P, N = np.concatenate(points), np.concatenate(normals)
+    corners = P.reshape(-1, 3, 3)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    keep = np.repeat(area > 1e-15, 3)  # at the poles every other triangle has no area
+    return P[keep], N[keep]
+
+
+@functools.lru_cache(maxsize=256)
+def read_obj(path: str, modified: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals and colours (3n, 3) of an OBJ's triangles; flat normals where it has none; NaN where its material
+    library says no colour (Kd)."""
+    points, normals, faces, colors = [], [], [], []
+    color, materials = (np.nan,) * 3, {}
+    for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
+        word, _, rest = line.partition(" ")
+        if word == "v":
+            points.append(rest)
+        elif word == "vn":
+            normals.append(rest)
+        elif word == "f":
+            corners = rest.split()
+            for k in range(1, len(corners) - 1):  # a fan of triangles
+                faces += (corners[0], corners[k], corners[k + 1])
+                colors.append(color)
+        elif word == "mtllib":
+            materials |= _materials(Path(path).parent / rest.strip())
+        elif word == "usemtl":
+            color = materials.get(rest.strip(), (np.nan,) * 3)
+    if not faces:
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
+    P = np.array(" ".join(" ".join(row.split()[:3]) for row in points).split(), float).reshape(-1, 3)
+    N = np.array(" ".join(normals).split(), float).reshape(-1, 3)
+    distinct: dict[str, int] = {}
+    order = np.array([distinct.setdefault(corner, len(distinct)) for corner in faces])
+    parts = [(corner.split("/") + ["", ""])[:3] for corner in distinct]
+    at = np.array([_index(part[0], len(P)) for part in parts])[order]
+    normal_at = np.array([_index(part[2], len(N)) if part[2] else -1 for part in parts])[order]
+    out = P[at]
+    corners = out.reshape(-1, 3, 3)
+    flat = np.repeat(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 3, axis=0)
+    given = normal_at >= 0
+    flat[given] = N[normal_at[given]]
+    return out, flat, np.repeat(np.array(colors), 3, axis=0)
+
+
+def _index(text: str, count: int) -> int:
+    """OBJ counts from 1, and from the end backwards."""
+    k = int(text)
+    return k - 1 if k > 0 else count + k
+
+
+def _materials(path: Path) -> dict[str, tuple[float, ...]]:
+    """Diffuse colours by material name; none where the library is missing."""
+    out: dict[str, tuple[float, ...]] = {}
+    name = ""
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+        words = line.split()
+        if words[:1] == ["newmtl"]:
+            name = " ".join(words[1:])
+        elif words[:1] == ["Kd"] and len(words) >= 4:
+            out[name] = tuple(float(word) for word in words[1:4])
+    return out
