@@ -419,7 +419,7 @@ def test_too_many_messages_for_memory_are_read_again_from_the_file(tmp_path, mon
         whole = ours(LogReader(path))
         monkeypatch.setattr(readers, "INDEX_LIMIT", 0)
         log = LogReader(path)
-        assert ours(log) == whole and log.timing()["example"][1].tolist() == [m.sequence for m in MESSAGES]
+        assert ours(log) == whole and log.timing(["example"])["example"][1].tolist() == [m.sequence for m in MESSAGES]
         monkeypatch.undo()
 
 

@@ -35,7 +35,7 @@ from valve_drake.recording.container import LIBRARY, RECOVERED, active
 from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.records import Buffer, Frame, Unsound
 
-INDEX_LIMIT = 256 << 20  # kept in memory; raise it if logs of hours are read too slowly [bytes]
+INDEX_LIMIT = 192 << 20  # kept in memory; raise it if logs of hours are read too slowly [bytes]
 LONGEST = 200  # of a reason in an error line [characters]
 DEFINITIONS_LIMIT = 64 << 20  # schemas and channels, in all [bytes]
 
@@ -207,8 +207,10 @@ class LogReader:
                 column.append(_reach(message, name.split(".")))
         return {"time": np.array(times)} | {name: _stack(column) for name, column in columns.items()}
 
-    def timing(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """When each message of each topic was logged (n,) [ns] and its number (n,), in the order of the file."""
+    def timing(self, topics: Iterable[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """When each message of these topics was logged (n,) [ns] and its number (n,), in the order of the file."""
+        wanted = {topic: self._by_topic[topic] for topic in topics}
+        ids_wanted = {id for ids in wanted.values() for id in ids}
         whens: dict[int, list[np.ndarray]] = {}
         numbers: dict[int, list[np.ndarray]] = {}
         for block in self._blocks:
@@ -217,9 +219,10 @@ class LogReader:
             channels, when, number = (rows[name][order] for name in ("channel", "when", "sequence"))
             starts = np.flatnonzero(np.diff(channels, prepend=channels[:1] ^ 1))
             for first, end in zip(starts, [*starts[1:], len(rows)]):
-                whens.setdefault(int(channels[first]), []).append(when[first:end])
-                numbers.setdefault(int(channels[first]), []).append(number[first:end])
-        found = {topic: [id for id in ids if id in whens] for topic, ids in self._by_topic.items()}
+                if (id := int(channels[first])) in ids_wanted:
+                    whens.setdefault(id, []).append(when[first:end])
+                    numbers.setdefault(id, []).append(number[first:end])
+        found = {topic: [id for id in ids if id in whens] for topic, ids in wanted.items()}
         return {
             topic: (
                 np.concatenate([np.empty(0, np.uint64), *(part for id in ids for part in whens[id])]),

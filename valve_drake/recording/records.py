@@ -18,7 +18,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Footer, Header, McapRecord, Metadata, Schema, Statistics
 
-MAX_CHUNK = 128 << 20  # unpacked; raise it if single messages are larger [bytes]
+MAX_CHUNK = 64 << 20  # unpacked; raise it if single messages are larger [bytes]
 HEAD = struct.Struct("<BQ")  # opcode, length of the body
 ROW = np.dtype(  # of a message, its opcode and length included
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("when", "<u8")]
