@@ -33,9 +33,8 @@ from mcap_samples import (
 from valve_drake import cli
 from valve_drake.checks import ConfigError
 from valve_drake.messages import ModeState, Status
-from valve_drake.recording import reader as readers
+from valve_drake.recording import contents, schemas
 from valve_drake.recording import records as mcap_records
-from valve_drake.recording import schemas
 from valve_drake.recording.container import LIBRARY
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recovery import recover
@@ -68,7 +67,7 @@ def ours(log: LogReader) -> list[tuple]:
     return [(one.when, one.published, one.sequence, one.data) for one in log.records()]
 
 
-VARIANTS = itertools.product([None, "", "zstd", "lz4"], [b"", b"\1\xff\xff"], SUMMARIES, [True, False])
+VARIANTS = list(itertools.product([None, "", "zstd", "lz4"], [b"", b"\1\xff\xff"], SUMMARIES, [True, False]))
 
 
 @pytest.mark.parametrize(("compression", "pad", "summary", "crcs"), VARIANTS)
@@ -234,7 +233,7 @@ def test_whatever_is_done_to_a_file_is_told_and_costs_only_what_was_hit(tmp_path
     found = [(when, data) for when, _, _, data in ours(log)]
     written = [(message.log_time, message.data) for message in messages]
     kept = collections.Counter(found) & collections.Counter(written)
-    chunked = b"\x06" in data and log._blocks and log._blocks[0].chunk is not None
+    chunked = b"\x06" in data and log._contents.blocks and log._contents.blocks[0].chunk is not None
     if chunked:
         assert kept.total() == len(found), "a chunk proves its messages"
     if kind in (0, 3):
@@ -344,6 +343,16 @@ def test_a_log_that_was_only_cut_is_recovered_with_0_and_a_word(tmp_path, capsys
     assert run(capsys, "review", tmp_path / "a.mcap.active")[0] == 3
 
 
+@pytest.mark.parametrize("filler", [b"\xa5", b"\0"])
+def test_a_cut_is_told_from_bytes_that_were_written_over(tmp_path, capsys, filler):
+    data = own_log(tmp_path / "a.mcap").read_bytes()
+    half = chunks(data)[3][0] + 40  # in a chunk's middle
+    (tmp_path / "b.mcap").write_bytes(data[:half] + filler * (len(data) - half))
+    code, out, _ = run(capsys, "recover", tmp_path / "b.mcap", "-o", tmp_path / "c.mcap")
+    assert "192 messages" in out and "breaks off" in out
+    assert (code, "bytes are damaged" in out) == ((0, False) if filler == b"\0" else (3, True))
+
+
 def test_recovering_again_does_not_forget_the_damage(tmp_path, capsys):
     data = bytearray(own_log(tmp_path / "a.mcap").read_bytes())
     data[chunks(data)[2][0] + 60] ^= 1
@@ -417,14 +426,14 @@ def test_too_many_messages_for_memory_are_read_again_from_the_file(tmp_path, mon
     for compression in PACK:
         path = Sample(compression=compression).write(tmp_path / f"{compression}.mcap")
         whole = ours(LogReader(path))
-        monkeypatch.setattr(readers, "INDEX_LIMIT", 0)
+        monkeypatch.setattr(contents, "INDEX_LIMIT", 0)
         log = LogReader(path)
         assert ours(log) == whole and log.timing(["example"])["example"][1].tolist() == [m.sequence for m in MESSAGES]
         monkeypatch.undo()
 
 
 def test_definitions_are_bounded(tmp_path, monkeypatch):
-    monkeypatch.setattr(readers, "DEFINITIONS_LIMIT", 1000)
+    monkeypatch.setattr(contents, "DEFINITIONS_LIMIT", 1000)
     many = [dc.replace(SCHEMA, id=k, data=bytes(100)) for k in range(2, 100)]
     log = LogReader(Sample((SCHEMA, CHANNEL, *MESSAGES, *many)).write(tmp_path / "a.mcap"))
     assert log.topics["example"].count == 10 and any("take more than 1000 bytes" in line for line in log.damage)

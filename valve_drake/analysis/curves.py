@@ -3,7 +3,7 @@
 import dataclasses as dc
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,8 +21,19 @@ AXES = tuple(zip("xyz", (RED, GREEN, BLUE)))
 
 def make_plots(log: Traces) -> list[Plot]:
     """All plots of a run; those without lines have nothing in this log."""
-    makers = (_distance, _position_error, _angle_error, _servo_error, _servo_speed, _forces, _couple, _angle)
-    makers += (_angle_difference, _tracking, _health)
+    makers: tuple[Callable[[Traces], Plot], ...] = (
+        _distance,
+        _position_error,
+        _angle_error,
+        _servo_error,
+        _servo_speed,
+        _forces,
+        _couple,
+        _angle,
+        _angle_difference,
+        _tracking,
+        _health,
+    )
     plots = [log.attempt(f"plot {make.__name__[1:]}", functools.partial(make, log), None) for make in makers]
     return [plot if plot is not None else Plot("", "", []) for plot in plots]
 
@@ -36,7 +47,8 @@ def _distance(log: Traces) -> Plot:
         if true is not None:
             lines.append(Line("true", time, np.linalg.norm(true[:, :, 3], axis=1), GREY))
     if log.stereo is not None:
-        lines.append(Line("stage 1, stereo", *log.stereo, ORANGE, "rings"))
+        time, distance = log.stereo
+        lines.append(Line("stage 1, stereo", time, distance, ORANGE, "rings"))
     if found is not None and len(found.time):
         lines.append(Line("stage 2, rectangle", found.time, found.distance, BLUE, "dots"))
     return Plot("Distance of the marker", "m", lines, low=0.0, key="distance")

@@ -143,7 +143,8 @@ class Traces:
         length, NaN, texts where numbers are meant. One such topic must not cost the rest of the page.
         """
         try:
-            return make()
+            with np.errstate(all="ignore"):  # a warning of numpy's would be a line of its own on the terminal
+                return make()
         except Exception as error:
             self.missing[name] = f"holds values that cannot be used: {type(error).__name__}: {str(error)[:120]}"
             return default
