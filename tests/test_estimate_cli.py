@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import re
 
 import cv2
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 from drawn_scene import Drawing, draw_valve, facing, pose_error
 
 from valve_drake import frames
+from valve_drake.analysis.drawn_images import Canvas, draw_board
 from valve_drake.camera.calibration import triangulate_all
 from valve_drake.camera.calibration_file import save_camera
-from valve_drake.camera.lens import StereoHead, load_head
+from valve_drake.camera.lens import OpenCvLens, StereoHead, load_head
 from valve_drake.cli import main
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.photograph import look
@@ -105,6 +107,50 @@ def test_text_for_people_and_exit_1_when_there_is_no_marker(photos, capsys):
     assert code == 1 and not said["found"]
 
 
+def test_one_image_says_why_its_candidates_are_no_marker(photos, capsys):
+    code, said, _ = run(capsys, photos / "empty.png", *given(), "--json")
+    assert code == 1 and said["reason"] == "no candidate in the image"
+    code, said, _ = run(capsys, photos / "left.png", *given(marker="50x100"), "--json")
+    assert code == 1 and "right" not in said["reason"] and "candidate 0: shape" in said["reason"]
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_further_rectangles_of_the_shape_are_told_with_their_poses(photos, tmp_path, capsys, cameras):
+    truths = [facing(1.0, 0.2, 0.1, 0.1, 0.12, 0.0), facing(1.2, -0.2, 0.2, 0.0, -0.12, 0.02)]
+    paths = []
+    for side, lens, X_CL in zip(("left", "right"), HEAD.lenses(), (np.eye(3, 4), frames.inverse(HEAD.X_LR))):
+        canvas = Canvas(lens)
+        for X in truths:
+            draw_board(canvas, frames.compose(X_CL, X), MARKER)
+        paths.append(tmp_path / f"{side}.png")
+        cv2.imwrite(str(paths[-1]), canvas.finish(np.random.default_rng(0), 2.0)[:, :, ::-1])
+    code, said, _ = run(capsys, *paths[:cameras], *given(), "--json")
+    assert code == 0 and len(said["others"]) == 1
+    found = [said, said["others"][0]]
+    found.sort(key=lambda pose: pose["X_CV"][0][3], reverse=True)
+    assert all(sigmas_off(pose, X) < 3 for pose, X in zip(found, truths))
+    code, said, _ = run(capsys, *paths[:cameras], *given())
+    assert "2 red rectangles of this shape" in said["text"] and said["text"].count("position") == 2
+    code, said, _ = run(capsys, photos / "left.png", photos / "right.png", *given(), "--json")
+    assert said["others"] == []
+
+
+def test_a_drawing_replaces_no_photograph_and_nothing_unasked(photos, tmp_path, capsys):
+    photo = tmp_path / "photo.png"
+    photo.write_bytes((photos / "left.png").read_bytes())
+    link = tmp_path / "link.png"
+    link.symlink_to(photo)
+    before = photo.read_bytes()
+    for out in (photo, link):
+        for more in ((), ("--overwrite",)):
+            code, said, err = run(capsys, photo, *given(), "--draw", out, *more)
+            assert code == 2 and "--draw" in err and err.count("\n") == 1 and photo.read_bytes() == before
+    older = tmp_path / "older.png"
+    older.write_bytes(b"older")
+    assert run(capsys, photo, *given(), "--draw", older)[0] == 2 and older.read_bytes() == b"older"
+    assert run(capsys, photo, *given(), "--draw", older, "--overwrite")[0] == 0 and older.read_bytes() != b"older"
+
+
 def test_drawing_shows_both_photographs(photos, tmp_path, capsys):
     for name in ("left.png", "empty.png"):
         out = tmp_path / f"drawn_{name}"
@@ -152,6 +198,71 @@ def test_a_head_that_is_off_its_calibration_is_put_right_by_the_known_size(photo
         seen = look(images, StereoHead(HEAD.left, HEAD.right, drifted, rms_px=rms), (0.098, 0.100))
         errors.append(np.linalg.norm(seen.estimate.X_LV[:, 3] - X_LV[:, 3]) if seen.estimate.found else np.inf)
     assert errors[1] < 0.01 < errors[0]
+
+
+def drawn_pair(
+    X: np.ndarray,
+    seed: int,
+    down: float = 0.0,
+    turn: tuple = (0.0, 0.0, 0.0),
+    wider: float = 1.0,
+    gain: tuple = (1, 1, 1),
+) -> tuple[list[np.ndarray], StereoHead]:
+    """A rectified pair and its head; the right camera's image lies lower, and it is turned [deg] and wider, unknown
+    to the head."""
+    K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    lens, X_LR = OpenCvLens(K, np.zeros(5)), frames.make(np.eye(3), np.array([0.1, 0, 0]))
+    other = OpenCvLens(K * [[wider], [1], [1]] + [[0, 0, 320 * (1 - wider)], [0, 0, down], [0, 0, 0]], np.zeros(5))
+    really = frames.compose(X_LR, frames.make(frames.rotation(np.radians(turn)), np.zeros(3)))
+    rng, images = np.random.default_rng(seed), []
+    for camera, X_CL in ((lens, np.eye(3, 4)), (other, frames.inverse(really))):
+        canvas = Canvas(camera)
+        draw_board(canvas, frames.compose(X_CL, X), MARKER)
+        images.append(canvas.finish(rng, 2.0, gain, jpeg=95))
+    return images, StereoHead(lens, lens, X_LR)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *({"down": px} for px in (0.02, -0.2, 1.5, 2.5, 3.5, -4.5)),
+        *({"turn": turn} for turn in ((0.2, 0, 0), (0, 0.2, 0), (0, -0.1, 0.3))),
+        {"wider": 1.01},
+    ],
+)
+@pytest.mark.parametrize("method", ["refined", "paper"])
+def test_a_pair_that_is_not_as_calibrated_is_within_its_covariance_or_refused_in_px(change, method):
+    for k, X in enumerate((facing(1.0, 0, 0, 0, -0.28), facing(0.9, 0.25, -0.2, 0.4, 0.1))):
+        images, head = drawn_pair(X, k, **change)
+        found = look(images, head, (0.098, 0.100), method).estimate
+        if found.found:
+            assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+            off = np.abs(pose_error(found.X_LV, X)) / np.sqrt(np.diag(found.covariance))
+            assert off.max() < 4, off
+        else:
+            assert method == "paper" or abs(change["down"]) > 3  # the closed form is off for reasons of its own too
+            assert re.search(r"(epipolar:|residual) \d+\.\d+ px", found.reason)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("gain", [1.4, 2.0, 3.0])
+def test_clipped_light_widens_the_covariance(cameras, gain):
+    for k in range(3):
+        X = facing(0.7 + 0.1 * k, 0.3, 0.2 - 0.2 * k, 0.2, 0.05)
+        images, head = drawn_pair(X, k, gain=(gain, gain, gain))
+        found = look(images[:cameras], head if cameras == 2 else head.left, (0.098, 0.100)).estimate
+        assert found.found, found.reason
+        off = np.abs(pose_error(found.X_LV, X)) / np.sqrt(np.diag(found.covariance))
+        assert off.max() < 3, off
+
+
+def test_a_colour_that_is_clipped_takes_no_part_if_others_are_not():
+    X = facing(0.8, 0.3, 0.2, 0.2, 0.05)
+    for gain in ((2.0, 1, 1), (1, 1, 2.0)):
+        images, head = drawn_pair(X, 0, gain=gain)
+        found = look(images[:1], head.left, (0.098, 0.100)).estimate
+        assert found.found and np.linalg.norm(pose_error(found.X_LV, X)[3:]) < 5e-4
+        assert np.sqrt(found.covariance[5, 5]) < 5e-4
 
 
 # ---------------------------------------------------------------- photographs that nobody here took

@@ -23,6 +23,7 @@ from valve_drake.perception.rectangle_estimator import (
     _linearize,
     _moments,
     _views,
+    _weights,
     estimate,
     fuse,
 )
@@ -276,6 +277,82 @@ def test_cameras_that_are_not_as_calibrated_make_the_covariance_larger():
     assert right.found and wrong.found
     assert (np.diag(wrong.covariance) > 4 * np.diag(right.covariance)).all()
     assert wrong.ambiguity < right.ambiguity
+
+
+def off_the_epipolar_line(edges: MarkerEdges, px: float) -> MarkerEdges:
+    """The right image's points `px` lower."""
+    down = np.array([0.0, px / HEAD.right.focal()])
+    right = dc.replace(edges.right, points=edges.right.points + down, corners=edges.right.corners + down)
+    return dc.replace(edges, right=right)
+
+
+@pytest.mark.parametrize("told", ["points", "information", "information of one"])
+@pytest.mark.parametrize("method", ["refined", "paper"])
+@pytest.mark.parametrize("px", [-2.0, 0.02, 0.3, 1.0, 2.0, 3.0, 3.9, 5.0])
+def test_a_right_image_that_lies_lower_is_within_the_covariance_or_refused_with_its_size(told, method, px):
+    X = facing(1.0, 0.0, 0.02, 0.0, -0.25, 0.1)
+    edges = edge_points(X, HEAD, MARKER, 0.03, np.random.default_rng(0))
+    informed = with_information(edges)
+    edges = {"points": edges, "information": informed}.get(told, dc.replace(informed, left=edges.left))
+    config = dc.replace(CONFIG, method=method, max_residual=1.2)
+    found = estimate(off_the_epipolar_line(edges, px), HEAD, MARKER, config, Track(X))
+    if found.found:
+        assert abs(px) < 4
+        assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+        assert (np.abs(pose_error(found.X_LV, X)) < 4 * np.sqrt(np.diag(found.covariance))).all()
+        assert abs(pose_error(found.X_LV, X)[4]) < 0.01
+    else:
+        assert abs(px) > 1 and found.reason == f"epipolar: {abs(px):.1f} px"
+
+
+def test_robust_weights_leave_every_side_most_of_its_own():
+    X = facing(1.0, 0.0, 0.02, 0.0, -0.25, 0.1)
+    edges = off_the_epipolar_line(edge_points(X, HEAD, MARKER, 0.03, np.random.default_rng(0)), 2.5)
+    views, _ = _views(edges, HEAD, CONFIG)
+    for view in views:
+        off = np.where(view.side % 2 == 0, 3.0, 0.01)  # two sides lie off as a whole
+        weight = _weights(view, off, CONFIG)
+        assert (np.bincount(view.side, weight, 4) > 0.4 * np.bincount(view.side, minlength=4)).all()
+
+
+def test_edges_that_determine_no_pose_are_refused():
+    edges = with_information(edge_points(POSES[1], HEAD, MARKER, 0.05))
+    nothing = np.zeros((8, 8))
+    nothing[0, 0] = 1.0
+    one = dc.replace(edges, left=dc.replace(edges.left, information=nothing), right=QuadEdges(reason="not used"))
+    found = estimate(one, HEAD, MARKER, CONFIG)
+    assert not found.found and found.reason == "the sides do not determine a pose"
+
+
+@pytest.mark.parametrize("change", ["yaw", "roll", "wider", "other size"])
+def test_a_contradiction_between_the_cameras_is_within_the_covariance(change):
+    """Either the head is not as calibrated or the marker is of another size: the pose is off by what either makes."""
+    R, scale = np.eye(3), 1.0
+    if change in ("yaw", "roll"):
+        R = frames.rotation(np.radians(0.2) * np.array([0, 1, 0] if change == "yaw" else [0, 0, 1]))
+    really = dc.replace(HEAD, X_LR=frames.compose(HEAD.X_LR, frames.make(R, np.zeros(3))))
+    marker = Marker(size=[0.102, 0.104]) if change == "other size" else MARKER
+    for k, X in enumerate(POSES[:2]):
+        edges = edge_points(X, really, marker, 0.03, np.random.default_rng(k))
+        if change == "wider":
+            right = edges.right
+            scale = np.array([1.01, 1.0])
+            edges = dc.replace(
+                edges, right=dc.replace(right, points=right.points * scale, corners=right.corners * scale)
+            )
+        found = estimate(edges, HEAD, MARKER, dc.replace(CONFIG, max_residual=5.0, epipolar_gate=9.0), Track(X))
+        assert found.found, found.reason
+        off = np.abs(pose_error(found.X_LV, X)) / np.sqrt(np.diag(found.covariance))
+        assert off.max() < 4, off
+
+
+def test_a_bias_of_all_sides_widens_the_distance_that_one_eye_tells():
+    edges = with_information(edge_points(POSES[1], HEAD, MARKER, 0.05, cameras="left"))
+    biased = dc.replace(edges, left=dc.replace(edges.left, bias=np.full(4, 0.4)))
+    sure, unsure = (estimate(e, HEAD, MARKER, CONFIG, Track(POSES[1])) for e in (edges, biased))
+    side = np.linalg.norm(np.diff(edges.left.corners_px, axis=0), axis=1).mean()
+    assert unsure.covariance[5, 5] > 4 * sure.covariance[5, 5]
+    assert np.sqrt(unsure.covariance[5, 5]) < 0.8 / side * 1.5  # of a metre: both sides by 0.4 px of the width
 
 
 def test_covariance_is_honest_where_the_tilt_folds():

@@ -125,8 +125,8 @@ def test_rejected_candidates_take_no_part():
     left, right = candidates_of((facing(2.0), 0.098, 0.100))
     left = (dc.replace(left[0], rejected="fill: 0.5"),)
     assert match(left, right, HEAD, MARKER, CONFIG).reason == "no candidate in the left image"
-    assert single(left, HEAD.left, MARKER, CONFIG) == -1
-    assert single(right, HEAD.right, MARKER, CONFIG) == 0
+    assert single(left, HEAD.left, MARKER, CONFIG)[0] == -1
+    assert single(right, HEAD.right, MARKER, CONFIG) == (0, "")
 
 
 def test_two_to_one_marker_is_matched_whichever_way_it_hangs():

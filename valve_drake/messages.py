@@ -174,6 +174,7 @@ class QuadEdges(Message):
     points: np.ndarray = array(-1, 2)  # edge points (x', y'), normalised, undistorted
     side: np.ndarray = array(-1)  # 0..3: the side that each point belongs to
     sigma: float = 0.0  # standard deviation of a point along the edge's normal [px]
+    bias: np.ndarray = array(4)  # standard deviation of an error that moves all sides inward, or all outward [px]
     corners: np.ndarray = array(4, 2)  # intersections of the fitted lines, normalised
     # Of the distances of eight points, two on each side of `corners` at joint_fit.NODES of its length, from the side
     # (px of the raw image, positive inward); all zero where the points are all that is known [1/px^2].

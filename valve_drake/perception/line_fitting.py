@@ -33,6 +33,7 @@ _LEVEL_TERMS = Terms((0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (4, 0))
 _LEVEL_PRIOR = np.diag([1e-9, 0.1, 1e-9, 0.1, 1e-6, 1e-6])
 _CURVE_PRIOR, _BEND = np.diag([1e-9, 1e-9, 0.0]), np.diag([0.0, 0.0, 1.0])
 _FOUR = np.arange(4)
+_ALONG = (np.arange(12) + 0.5) / 12  # of a side's length: where light beside it is looked at
 _REACH = 4.5  # half a profile's length that holds a blurred step [blur]
 _PAD = 12  # least room round the quadrilateral [px]
 _LARGE = 100  # of a quadrilateral of this size colours and coarse lines are looked for at half resolution [px]
@@ -43,6 +44,9 @@ _LEAST_HALF = 2  # half a profile's length at a side's ends, where the light pla
 _LEAN = 2.5  # ... and the pixels along the side that it needs for one more
 _ENOUGH = 30  # profiles of a side that find the way to its edge
 _GROWN = np.array([0.75, 1.14, 1.3])  # the marker's inside, and a ring of its surroundings, over its size
+_DARK, _BRIGHT = 2, 253  # a value up to the one, or from the other on, may be clipped
+_CLIPPED_SHARE = 0.05  # of the pixels beside the sides that are clipped, from which a colour channel is left out
+_CLIPPED_BIAS = 0.6  # error of a side whose level is clipped, the same way on all sides [blur]
 _SHARP = 0.8  # blur that is looked for first: a lens in focus, and the pixel itself [px]
 
 
@@ -85,6 +89,7 @@ class RawQuad:
     side: np.ndarray = dc.field(default_factory=lambda: np.zeros(0, int))  # (n,) 0..3
     sigma: float = 0.0  # of a point along the side's normal [px]
     blur: float = 0.0  # standard deviation of the edge's spread [px]
+    bias: np.ndarray = dc.field(default_factory=lambda: np.zeros(4))  # of each side by clipped light, see QuadEdges
     together: np.ndarray | None = None  # (4, n, 2) points on the sides, from the fit of all four together [px]
     information: np.ndarray | None = None  # (8, 8) of the sides so fitted, see QuadEdges [1/px^2]
     reason: str = ""
@@ -100,11 +105,14 @@ def fit_pair(
     """Edges of the marker in both head images: of the pair of candidates that `match` chooses."""
     cameras = ((pair.left, head.left), (pair.right, head.right))
     found = match(pair.left.candidates, pair.right.candidates, head, marker, matching)
-    chosen = [found.left, found.right]
+    chosen, why_none = [found.left, found.right], found.reason
     if found.reason and config.single_camera:
-        chosen = [single(seen.candidates, lens, marker, matching) for seen, lens in cameras]
+        alone = [single(seen.candidates, lens, marker, matching) for seen, lens in cameras]
+        chosen = [k for k, _ in alone]
         if min(chosen) >= 0:  # both see one, but not the same: neither can be trusted
             chosen = [-1, -1]
+        elif pair.right.frame.image.size == 0:  # there is one image only
+            why_none = alone[0][1]
     quads: list[QuadEdges | None] = [None, None]
     used = [k for k in (0, 1) if chosen[k] >= 0]
     candidates = [cameras[k][0].candidates[chosen[k]] for k in used]
@@ -113,7 +121,7 @@ def fit_pair(
     for k, candidate, one in zip(used, candidates, raw):
         seen, lens = cameras[k]
         quads[k] = _edges_of(one, candidate, seen.green, lens, config.max_sigma)
-    quads = [quad or QuadEdges(reason=found.reason) for quad in quads]
+    quads = [quad or QuadEdges(reason=why_none) for quad in quads]
     reason = ""
     if quads[0].found and quads[1].found:
         reason = wrong_size(quads[0].corners, quads[1].corners, head, marker, matching)
@@ -149,6 +157,7 @@ def _edges_of(
         points=points[:n],
         side=raw.side,
         sigma=raw.sigma,
+        bias=raw.bias,
         corners=corners,
         corners_px=lens.project(corners),
         information=np.zeros((8, 8)) if raw.information is None else raw.information,
@@ -171,14 +180,14 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
         high = np.minimum(np.ceil(most).astype(int) + pad + 1, [image.shape[1], image.shape[0]])
         if (high - low < 6).any():
             continue
-        channel, contrast = _mix(image[low[1] : high[1], low[0] : high[0]], start - low, config)
+        channel, contrast, clipped = _mix(image[low[1] : high[1], low[0] : high[0]], start - low, config)
         if contrast < config.min_contrast:
             out[k] = RawQuad(reason=f"contrast: {contrast:.0f}")
             continue
-        parts.append((k, channel, low, start - low))
+        parts.append((k, channel, low, start - low, clipped))
     if not parts:
         return out
-    number, channels, lows, near = zip(*parts)
+    number, channels, lows, near, clipped = zip(*parts)
     sheet = Sheet.of(channels)
     coarse = _hough_corners(sheet, np.array(near) + sheet.low[:, None])
     sides, reasons = _place(sheet, coarse, config)
@@ -197,6 +206,8 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
             back = lows[q] - sheet.low[q]
             together = None if raw.together is None else raw.together + back
             raw = dc.replace(raw, points=raw.points + back, together=together)
+            if clipped[q].any():
+                raw = dc.replace(raw, bias=_CLIPPED_BIAS * max(raw.blur, _SHARP) * clipped[q])
         out[k] = raw
     return out
 
@@ -227,8 +238,13 @@ def side_lines(points: np.ndarray, side: np.ndarray, sides: int = 4) -> tuple[np
     return lines, math.sqrt(max(square, 0.0) / max(len(points) - 2 * sides, 1))
 
 
-def _mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np.ndarray, float]:
-    """One linear channel, float32: about 1 inside, about 0 outside; and the contrast it has [grey levels]."""
+def _mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np.ndarray, float, np.ndarray]:
+    """One linear channel, float32: about 1 inside, about 0 outside; the contrast it has [grey levels]; and the share
+    of clipped light beside each side that is in it (4,).
+
+    A colour whose light is clipped takes no part if the others have contrast enough.
+    """
+    clipped = _clipped(part, corners)
     step = 2 if (corners.max(0) - corners.min(0)).max() > _LARGE else 1
     small, corners = _every(part, step), corners / step
     if config.gamma != 1.0:
@@ -243,11 +259,35 @@ def _mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np
     difference = core - ring
     if config.color_only:
         difference = difference - difference.mean()
+    lost = np.zeros(4)
+    if clipped is not None:
+        whole = np.where(clipped.mean(0) > _CLIPPED_SHARE, 0.0, difference)
+        if np.linalg.norm(whole) > 2 * config.min_contrast:
+            difference = whole
+        lost = clipped @ np.abs(difference) / max(float(np.abs(difference).sum()), 1e-9)
     contrast = float(np.linalg.norm(difference))
     if contrast < 1e-3:
-        return part[:, :, 0], 0.0
+        return part[:, :, 0], 0.0, lost
     w = difference / (difference @ (core - ring))
-    return cv2.transform(part.astype(np.float32), np.array([[*w, -w @ ring]], np.float32)), contrast
+    return cv2.transform(part.astype(np.float32), np.array([[*w, -w @ ring]], np.float32)), contrast, lost
+
+
+def _clipped(part: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
+    """The share of clipped pixels beside each side, inside or outside, whichever is larger, in each colour: (4, 3).
+
+    None if there are none. An edge that is fitted to a clipped level lies off, towards the level that is not clipped.
+    """
+    if part.max() < _BRIGHT and part.min() > _DARK:
+        return None
+    along = corners[NEXT] - corners
+    lengths = np.sqrt((along * along).sum(1))
+    inward = np.stack([-along[:, 1], along[:, 0]], -1) / lengths[:, None]
+    beside = min(max(0.12 * float(lengths.min()), 3.0), 6.0) * np.array([[[[1.0]]], [[[-1.0]]]])
+    at = corners[:, None] + along[:, None] * _ALONG[:, None] + beside * inward[:, None]  # (2, 4, n, 2)
+    u, v = np.rint(at).astype(int).transpose(3, 0, 1, 2)
+    values = part[np.clip(v, 0, part.shape[0] - 1), np.clip(u, 0, part.shape[1] - 1)]
+    share = ((values >= _BRIGHT) | (values <= _DARK)).mean(2).max(0)
+    return share if share.any() else None
 
 
 def _every(image: np.ndarray, step: int) -> np.ndarray:

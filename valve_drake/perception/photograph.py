@@ -14,13 +14,15 @@ import numpy as np
 
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import ConfigError
-from valve_drake.messages import CameraFrame, MarkerEdges, QuadEdges, RectangleEstimate, Segmentation, SegmentationPair
+from valve_drake.messages import CameraFrame, QuadEdges, RectangleEstimate, Segmentation, SegmentationPair
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, estimate
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig, turn_between
+from valve_drake.perception.stereo_positioning import StereoPositioningConfig, epipolar_offset, turn_between
 
+_SIDES = ("left", "right")
+_MOST_OTHERS = 8  # further rectangles that are looked for; each costs as much as the first
 _SLACK = 3.0  # by how many rms of its calibration a head may be off
 
 
@@ -35,6 +37,77 @@ class Look:
     epipolar_px: float  # distance of the right centre from the left one's epipolar line
 
 
+@dc.dataclass(frozen=True)
+class _Stages:
+    """The stages' configurations for photographs of one head, or of one lens in both its places."""
+
+    head: StereoHead
+    images: int
+    slack: float  # by which the head may be off its calibration [px]
+    marker: Marker
+    coloring: ColorSegmentationConfig
+    lines: LineFittingConfig
+    matching: StereoPositioningConfig
+    fitting: RectangleEstimatorConfig
+
+    @classmethod
+    def of(cls, cameras: StereoHead | LensModel, images: int, size: tuple[float, float], method: str) -> "_Stages":
+        """Raises ConfigError for an impossible marker."""
+        head = cameras if isinstance(cameras, StereoHead) else StereoHead(cameras, cameras, np.eye(3, 4))
+        slack = _SLACK * head.rms_px if images == 2 else 0.0
+        stages = cls(
+            head=head,
+            images=images,
+            slack=slack,
+            marker=Marker(size=list(size), handle_radius=max(0.15, max(size))),
+            coloring=ColorSegmentationConfig(min_fill=0.78),  # blurred colours round the corners off
+            lines=LineFittingConfig(max_sigma=1.5, single_camera=images == 1),
+            matching=StereoPositioningConfig(epipolar_gate=4.0 + slack, size_gate=0.3, side_gate=0.3),
+            fitting=RectangleEstimatorConfig(
+                method=method,
+                yaw_sigma=slack / head.right.focal(),
+                max_residual=1.2,
+                epipolar_gate=4.0 + slack,
+                size_gate=0.2,
+                min_distance=0.1,
+            ),
+        )
+        for config in (stages.marker, stages.coloring, stages.lines, stages.matching, stages.fitting):
+            config.check()
+        return stages
+
+    def segment(self, images: list[np.ndarray]) -> tuple[Segmentation, ...]:
+        cameras = (CameraFrame(camera=name, image=np.array(image)) for name, image in zip(_SIDES, images))
+        return tuple(segmented(frame, self.coloring) for frame in cameras)
+
+    def locate(self, seen: tuple[Segmentation, ...]) -> Look:
+        """The pose of the marker among the candidates of one or two segmented images."""
+        head, lenses = self.head, self.head.lenses()[: self.images]
+        pair = SegmentationPair(left=seen[0], right=seen[1] if self.images == 2 else Segmentation())
+        edges = fit_pair(pair, head, self.marker, self.lines, self.matching)
+        shift = np.zeros(2)
+        if edges.left.found and edges.right.found:
+            shift = epipolar_offset(edges.left.corners, edges.right.corners, head.X_LR)
+        moved = edges
+        if self.slack:
+            right = dc.replace(edges.right, points=edges.right.points - shift, corners=edges.right.corners - shift)
+            moved = dc.replace(edges, right=right)
+        found = estimate(moved, head, self.marker, self.fitting)
+        quads = (edges.left, edges.right)[: self.images]
+        corners: list[np.ndarray | None] = [None] * self.images
+        if found.found:
+            corners = [quad.corners_px if quad.found else None for quad in quads]
+            if found.method == "refined":
+                model = self.marker.corners() @ found.X_LV[:, :3].T + found.X_LV[:, 3]
+                in_each = (model, (model - head.X_LR[:, 3]) @ head.X_LR[:, :3])
+                each = zip(in_each, quads, lenses)
+                corners = [_fitted(P, quad, lens) if quad.found else None for P, quad, lens in each]
+            elif len(corners) == 2 and corners[0] is not None and corners[1] is not None:
+                corners[1] = np.roll(corners[1], -turn_between(corners[0], corners[1]), axis=0)
+        epipolar = float(np.linalg.norm(shift)) * head.right.focal()
+        return Look(estimate=found, seen=seen, edges=quads, corners_px=tuple(corners), epipolar_px=epipolar)
+
+
 def look(
     images: list[np.ndarray], cameras: StereoHead | LensModel, size: tuple[float, float], method: str = "refined"
 ) -> Look:
@@ -42,55 +115,38 @@ def look(
 
     images: (H, W, 3) uint8 RGB each. Raises ConfigError for an impossible marker or images of another size.
     """
-    single = not isinstance(cameras, StereoHead)
-    head = StereoHead(cameras, cameras, np.eye(3, 4)) if single else cameras
-    lenses = head.lenses()[: len(images)]
-    for name, image, lens in zip(("left", "right"), images, lenses):
+    stages = _Stages.of(cameras, len(images), size, method)
+    for name, image, lens in zip(_SIDES, images, stages.head.lenses()):
         if image.shape[:2] != (lens.height, lens.width):
             which, (height, width) = name if len(images) == 2 else "the", image.shape[:2]
             raise ConfigError(f"{which} image is {width} x {height}, its calibration for {lens.width} x {lens.height}")
-    slack = _SLACK * head.rms_px if len(images) == 2 else 0.0  # [px]
-    marker = Marker(size=list(size), handle_radius=max(0.15, max(size)))
-    coloring = ColorSegmentationConfig(min_fill=0.78)  # blurred colours round the corners off
-    lines = LineFittingConfig(max_sigma=1.5, single_camera=len(images) == 1)
-    matching = StereoPositioningConfig(epipolar_gate=4.0 + slack, size_gate=0.3, side_gate=0.3)
-    fitting = RectangleEstimatorConfig(
-        method=method, yaw_sigma=slack / head.right.focal(), max_residual=1.2, size_gate=0.2, min_distance=0.1
-    )
-    for config in (marker, coloring, lines, matching, fitting):
-        config.check()
-    seen = []
-    for name, image in zip(("left", "right"), images):
-        seen.append(segmented(CameraFrame(camera=name, image=np.array(image)), coloring))
-    pair = SegmentationPair(left=seen[0], right=seen[1] if len(seen) == 2 else Segmentation())
-    edges = fit_pair(pair, head, marker, lines, matching)
-    shift = np.zeros(2)
-    if edges.left.found and edges.right.found:
-        shift = _off_the_epipolar_line(edges, head)
-    moved = edges
-    if slack:
-        right = dc.replace(edges.right, points=edges.right.points - shift, corners=edges.right.corners - shift)
-        moved = dc.replace(edges, right=right)
-    found = estimate(moved, head, marker, fitting)
-    quads = (edges.left, edges.right)[: len(images)]
-    corners: list[np.ndarray | None] = [None] * len(images)
-    if found.found:
-        corners = [quad.corners_px if quad.found else None for quad in quads]
-        if method == "refined":
-            model = marker.corners() @ found.X_LV[:, :3].T + found.X_LV[:, 3]
-            in_each = (model, (model - head.X_LR[:, 3]) @ head.X_LR[:, :3])
-            corners = [_fitted(P, quad, lens) if quad.found else None for P, quad, lens in zip(in_each, quads, lenses)]
-        elif len(corners) == 2 and corners[0] is not None and corners[1] is not None:
-            corners[1] = np.roll(corners[1], -turn_between(corners[0], corners[1]), axis=0)
-    epipolar = float(np.linalg.norm(shift)) * head.right.focal()
-    return Look(estimate=found, seen=tuple(seen), edges=quads, corners_px=tuple(corners), epipolar_px=epipolar)
+    return stages.locate(stages.segment(images))
 
 
-def _off_the_epipolar_line(edges: MarkerEdges, head: StereoHead) -> np.ndarray:
-    """By how much the right centre is off the left one's epipolar line, in the right ideal image (2,)."""
-    a, b = (np.append(quad.corners.mean(0), 1.0) for quad in (edges.left, edges.right))
-    line = head.X_LR[:, :3].T @ np.cross(head.X_LR[:, 3], a)
-    return line[:2] * (line @ b) / max(line[:2] @ line[:2], 1e-300)
+def look_for_others(
+    first: Look, cameras: StereoHead | LensModel, size: tuple[float, float], method: str = "refined"
+) -> list[Look]:
+    """Further red rectangles in the same photographs that the marker's size and shape fit as well, best first."""
+    stages = _Stages.of(cameras, len(first.seen), size, method)
+    others: list[Look] = []
+    one = first
+    for _ in range(_MOST_OTHERS):
+        seen = tuple(_without(one_seen, quad) for one_seen, quad in zip(one.seen, one.edges))
+        if seen == one.seen:  # nothing was chosen: no candidate is left that could be the marker
+            break
+        one = stages.locate(seen)
+        if one.estimate.found:
+            others.append(one)
+    return others
+
+
+def _without(seen: Segmentation, quad: QuadEdges) -> Segmentation:
+    """The segmentation with the candidate that `quad` was fitted to rejected; the same one if there is none."""
+    for k, candidate in enumerate(seen.candidates):
+        if not candidate.rejected and (candidate.center == quad.center_px).all():
+            taken = dc.replace(candidate, rejected="seen as a marker already")
+            return dc.replace(seen, candidates=(*seen.candidates[:k], *seen.candidates[k + 1 :], taken))
+    return seen
 
 
 def _fitted(P: np.ndarray, quad: QuadEdges, lens: LensModel) -> np.ndarray:

@@ -33,10 +33,14 @@ from valve_drake.messages import MarkerEdges, QuadEdges, RectangleEstimate
 from valve_drake.perception.joint_fit import NODES
 from valve_drake.perception.line_fitting import meet, side_lines
 from valve_drake.perception.marker import NEXT, Marker
-from valve_drake.perception.stereo_positioning import turn_between
+from valve_drake.perception.stereo_positioning import epipolar_offset, turn_between
 
 METHODS = ("refined", "paper")
-_HOPELESS = 1000.0  # chi^2 above the best from which no further start is refined
+_PRUNE_CHI2 = 1000.0  # a start whose chi^2 is this much above the best one's is not refined
+_CONTRADICTED = 12.0  # fall of chi^2 by another right camera from which the head's calibration is doubted
+_OTHER_CAMERA = np.array([0.02, 0.02, 0.02, 0.03, 0.03])  # prior on it: its turn [rad], its magnifications [relative]
+_UNEVEN_BIAS = 0.1  # part of a side's `QuadEdges.bias` in which it differs from the other sides
+_LEAST_WEIGHT = 0.5  # share of a side's own weight below which the joint fit may not push it
 _SHORT_SIDE = 40.0  # blur and surroundings bias shorter sides more [px]
 _FOUR, _EYE, _NODES = np.arange(4), np.eye(8), np.array(NODES)[:, None]
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
@@ -71,6 +75,9 @@ class RectangleEstimatorConfig(Config):
         9.0, 0.0, 1e6, "chi^2 by which the mirror image must be worse; below, the track decides"
     )
     max_residual: float = number(0.8, 1e-3, 100.0, "rms of the edge points about the fit [px]")
+    epipolar_gate: float = number(
+        4.0, 0.01, 100.0, "distance of the right centre from the left one's epipolar line that is allowed [px]"
+    )
     size_gate: float = number(
         0.1, 1e-3, 10.0, "difference of distance by triangulation and by the fit that is allowed [relative]"
     )
@@ -104,6 +111,7 @@ class _View:
     side: np.ndarray  # (n,) int
     scale: np.ndarray  # (4,) px of the raw image per unit of distance from each side in the ideal one
     sigma: float  # [px]
+    bias: np.ndarray  # (4,) of the sides, all inward or all outward [px]
     lines: np.ndarray  # (4, 3)
     corners: np.ndarray  # (4, 2)
     green: np.ndarray  # (m, 2)
@@ -137,7 +145,30 @@ class _Fit:
 def estimate(
     edges: MarkerEdges, head: StereoHead, marker: Marker, config: RectangleEstimatorConfig, track: Track | None = None
 ) -> RectangleEstimate:
-    """The marker's pose from the edges of one or two cameras; `found` is False with a `reason` if there is none."""
+    """The marker's pose from the edges of one or two cameras; `found` is False with a `reason` if there is none.
+
+    The covariance of a pose that is found is positive definite.
+    """
+    try:
+        found = _estimate(edges, head, marker, config, track)
+        np.linalg.cholesky(_correlation(found.covariance) if found.found else np.eye(6))
+    except np.linalg.LinAlgError:
+        return _refuse(edges, config, "the sides do not determine a pose")
+    return found
+
+
+def _correlation(covariance: np.ndarray) -> np.ndarray:
+    """The covariance with unit diagonal. Raises LinAlgError for a variance that is none."""
+    variance = np.diag(covariance)
+    if not (np.isfinite(covariance).all() and (variance > 0).all()):
+        raise np.linalg.LinAlgError("no variance")
+    scale = 1 / np.sqrt(variance)
+    return covariance * np.outer(scale, scale)
+
+
+def _estimate(
+    edges: MarkerEdges, head: StereoHead, marker: Marker, config: RectangleEstimatorConfig, track: Track | None
+) -> RectangleEstimate:
     views, reason = _views(edges, head, config)
     if reason:
         return _refuse(edges, config, reason)
@@ -154,10 +185,13 @@ def estimate(
     best = fits[0]
     ambiguity = fits[1].cost - best.cost if len(fits) > 1 else 0.0
     if config.method == "paper":
+        step, refined = _contradiction(moments, model, best), best
         best, covariance, reason = _paper(views, model, config)
         if reason:
             return _refuse(edges, config, reason)
         inflation = 1.0
+        if step is not None:  # from this pose to the one that the other camera makes of the refined one
+            step = np.append(frames.rotation_vector(best.R.T @ refined.R), refined.p - best.p) + step
     else:
         told = all(view.information.any() for view in views)
         if not told:
@@ -169,11 +203,17 @@ def estimate(
         covariance = _covariance(moments, model, best)
         # Misfit of whole sides, that independent points do not show: calibration, a marker that is not flat.
         inflation = (best.cost - moments.floor) / (8 * len(views) - 6)
+        step = _contradiction(moments, model, best)
     square = sum(float((w * _point_residuals(v, best, model) ** 2).sum()) for v, w in zip(views, weights))
     residual = math.sqrt(square / max(sum(float(w.sum()) for w in weights), 1e-9))
     if inflation > _chance(8 * len(views) - 6):
         covariance, ambiguity = covariance * inflation, ambiguity / inflation
     reason = _gate(views, best, residual, config)
+    if step is not None:
+        # Either the right camera is not as calibrated, which `step` makes good, or the marker is of another size, and
+        # the triangulated distance is right: the covariance holds both.
+        other_size = np.append(np.zeros(3), (_triangulated_distance(views) / math.hypot(*best.p) - 1) * best.p)
+        covariance = covariance + np.outer(step, step) + np.outer(other_size, other_size)
     X_LV = frames.make(best.R, best.p)
     X_other = frames.make(fits[1].R, fits[1].p) if len(fits) > 1 else X_LV
     return RectangleEstimate(
@@ -251,6 +291,7 @@ def _view(
         side=side,
         scale=1 / stretch,
         sigma=sigma,
+        bias=quad.bias,
         lines=lines,
         corners=corners,
         green=quad.green,
@@ -313,13 +354,14 @@ def _aligned(left: _View, right: _View) -> _View:
     turn = turn_between(left.corners, right.corners)
     if turn == 0:
         return right
-    lines, corners, scale = (a[(_FOUR + turn) % 4] for a in (right.lines, right.corners, right.scale))
+    lines, corners, scale, bias = (a[(_FOUR + turn) % 4] for a in (right.lines, right.corners, right.scale, right.bias))
     nodes = (np.arange(8) + 2 * turn) % 8
     information = right.information[np.ix_(nodes, nodes)]
     return dc.replace(
         right,
         side=(right.side - turn) % 4,
         scale=scale,
+        bias=bias,
         lines=lines,
         corners=corners,
         information=information,
@@ -334,6 +376,7 @@ def _moments(views: list[_View], weights: list[np.ndarray], config: RectangleEst
     lengths = np.sqrt((along * along).sum(2)) * np.array([[view.focal] for view in views])
     # A side is not better known than its common bias, however many points it has.
     biases = config.side_bias * np.minimum(np.maximum((_SHORT_SIDE / lengths) ** 3, 1), 10)
+    biases = np.hypot(biases, [_UNEVEN_BIAS * view.bias for view in views])
     told = [k for k, view in enumerate(views) if view.information.any()]
     if told:
         # Two nodes make a side: each has twice the variance of the bias.
@@ -363,6 +406,12 @@ def _moments(views: list[_View], weights: list[np.ndarray], config: RectangleEst
         half, gap = (S[:, 0, 0] + S[:, 1, 1]) / 2, np.hypot((S[:, 0, 0] - S[:, 1, 1]) / 2, S[:, 0, 1])
         floor += float(np.maximum(half - gap, 0).sum())
         rows.reshape(4, 3, 4, 3)[_FOUR, :, _FOUR] = out
+    for view, rows in zip(views, B):
+        if view.bias.any():
+            # Whitening: residuals with the covariance I + a a^T, a being what one standard deviation does to them.
+            a = rows[:, 2::3] @ (view.bias / view.scale)
+            aa = float(a @ a)
+            rows -= np.outer(a, a @ rows) * ((1 - 1 / math.sqrt(1 + aa)) / max(aa, 1e-300))
     X_CL = np.array([view.X_CL for view in views])
     right = np.array([float(view.right) for view in views])
     yaw_prior = 1 / config.yaw_sigma**2 if config.yaw_sigma > 0 and right.any() else 0.0
@@ -380,14 +429,23 @@ def _point_residuals(view: _View, fit: _Fit, model: np.ndarray) -> np.ndarray:
 
 
 def _weights(view: _View, residual: np.ndarray, config: RectangleEstimatorConfig) -> np.ndarray:
-    """Robust weight of each point; its scale is the residuals' own where a systematic misfit exceeds the noise."""
+    """Robust weight of each point; its scale is the residuals' own where a systematic misfit exceeds the noise.
+
+    A side that lies off the joint fit as a whole keeps the weights from its own line: outliers are single points, and
+    without a side the pose is free to go anywhere.
+    """
     off = np.abs(residual)
     scale = config.loss_width * max(view.sigma, 1.48 * float(np.median(off)))
     if config.loss == "tukey":
-        return np.where(off < scale, (1 - (off / scale) ** 2) ** 2, 0.0) if (off > 0.9 * scale).any() else view.trust
-    if config.loss == "huber":
-        return view.trust * np.minimum(1.0, scale / np.maximum(off, 1e-12))
-    return np.ones(len(off))
+        if not (off > 0.9 * scale).any():
+            return view.trust
+        weight = np.where(off < scale, (1 - (off / scale) ** 2) ** 2, 0.0)
+    elif config.loss == "huber":
+        weight = view.trust * np.minimum(1.0, scale / np.maximum(off, 1e-12))
+    else:
+        return np.ones(len(off))
+    emptied = np.bincount(view.side, weight, 4) < _LEAST_WEIGHT * np.bincount(view.side, view.trust, 4)
+    return np.where(emptied[view.side], view.trust, weight)
 
 
 # ---------------------------------------------------------------- refined: least squares on the known rectangle
@@ -405,10 +463,11 @@ def _model_sides(model: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _linearize(
-    moments: _Moments, model: np.ndarray, R: np.ndarray, p: np.ndarray, yaw: float
+    moments: _Moments, model: np.ndarray, R: np.ndarray, p: np.ndarray, yaw: float, other_camera: bool = False
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Residuals (12 views,) in sigmas and Jacobian by theta (R exp([theta]x)), p and, if unknown, yaw; None if behind
-    a camera."""
+    a camera. other_camera: instead of by yaw, by a turn of the right camera about its x, y and z, and by its
+    magnification along x and y."""
     R_CL, p_CL = moments.R_CL, moments.p_CL
     if yaw:
         back = np.stack([frames.rot_y(-yaw * right) for right in moments.right])
@@ -423,13 +482,17 @@ def _linearize(
     of_both[:, 0, :, :3] = A
     np.matmul((t @ _SKEW).reshape(count, 3, 3), A, out=of_both[:, 0, :, 3:])
     turned = of_both @ both  # (C, 4, 3, 4)
-    n = 7 if moments.yaw_prior else 6
+    n = 11 if other_camera else 7 if moments.yaw_prior else 6
     dh = np.empty((count, 4, 3, n + 1))  # by theta, p, yaw; the last column is h itself
     dh[..., :3], dh[..., n] = turned[..., :3], turned[..., 3]
     dh[..., 3:6] = (e @ A.transpose(0, 2, 1) @ -_SKEW).reshape(count, 4, 3, 3) @ R_CL[:, None]
     if n == 7:
         x, y, z = dh[..., 7].transpose(2, 0, 1) * moments.right[:, None]
         dh[:, :, 0, 6], dh[:, :, 1, 6], dh[:, :, 2, 6] = -z, 0, x  # -e_y x h
+    elif n == 11:
+        h = dh[..., 11] * moments.right[:, None, None]
+        dh[..., 6:9] = (h @ _SKEW).reshape(count, 4, 3, 3)  # column k is -e_k x h
+        dh[..., 9:11] = h[..., None] * [[0, 1], [1, 0], [1, 1]]
     xy = dh[..., :2, n]
     dh /= np.sqrt((xy * xy).sum(-1))[..., None, None]
     line = dh[..., n].copy()
@@ -508,6 +571,23 @@ def _covariance(moments: _Moments, model: np.ndarray, fit: _Fit) -> np.ndarray:
     return np.linalg.inv(at[1].T @ at[1] + np.diag(fit.prior))[:6, :6]
 
 
+def _contradiction(moments: _Moments, model: np.ndarray, fit: _Fit) -> np.ndarray | None:
+    """The step of the pose (6,) that another right camera than the calibrated one would make, if the sides contradict
+    the calibration; None if they do not."""
+    if len(moments.right) < 2 or fit.cost - moments.floor < _CONTRADICTED:
+        return None
+    at = _linearize(moments, model, fit.R, fit.p, fit.yaw, other_camera=True)
+    if at is None:
+        return None
+    r, J = at
+    H, g = J.T @ J, J.T @ r
+    H[range(6, 11), range(6, 11)] += 1 / _OTHER_CAMERA**2
+    H[7, 7] += moments.yaw_prior
+    g[7] += moments.yaw_prior * fit.yaw
+    step = -np.linalg.solve(H, g)
+    return step[:6] if -g @ step > _CONTRADICTED else None
+
+
 def _candidates(
     views: list[_View], moments: _Moments, model: np.ndarray, config: RectangleEstimatorConfig
 ) -> list[_Fit]:
@@ -520,18 +600,18 @@ def _candidates(
     )
     for rvec, tvec in zip(rvecs, tvecs) if ok else ():
         starts.append(_to_left(view, cv2.Rodrigues(rvec)[0], tvec.ravel()))
-    fits, hopeless = _distinct(moments, model, starts, config, [])
+    fits, pruned = _distinct(moments, model, starts, config, [])
     if not fits:
         closed = closed_form([v.corners for v in views], [v.X_CL for v in views], model, "exact")
-        fits, hopeless = _distinct(moments, model, [closed] if closed is not None else [], config, [])
-    if len(fits) == 1 and not hopeless:
+        fits, pruned = _distinct(moments, model, [closed] if closed is not None else [], config, [])
+    if len(fits) == 1 and not pruned:
         mirrored = _mirrored(fits[0].R, fits[0].p)
-        fits, hopeless = _distinct(moments, model, [mirrored], config, fits)
-        if len(fits) == 1 and not hopeless:
-            hopeless = [(_moved_to_fit(moments, model, *mirrored), mirrored[0])]
-    if len(fits) == 1 and math.isfinite(hopeless[0][0]):
+        fits, pruned = _distinct(moments, model, [mirrored], config, fits)
+        if len(fits) == 1 and not pruned:
+            pruned = [(_moved_to_fit(moments, model, *mirrored), mirrored[0])]
+    if len(fits) == 1 and math.isfinite(pruned[0][0]):
         # The other tilt itself, moved to fit, stands for a minimum that it may not have.
-        cost, R = hopeless[0]
+        cost, R = pruned[0]
         fits.append(dc.replace(fits[0], R=R, cost=max(cost, fits[0].cost), at=None))
     return fits
 
@@ -545,21 +625,21 @@ def _distinct(
 ) -> tuple[list[_Fit], list[tuple[float, np.ndarray]]]:
     """`known` and the fits from `starts` that end elsewhere, best first; and chi^2 and R of those before the cameras
     that were so much worse than a known one that they were left."""
-    fits, hopeless = list(known), []
+    fits, pruned = list(known), []
     for R, p in starts:
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
             continue
         if fits:
             cost = _moved_to_fit(moments, model, R, p)
-            if cost > fits[0].cost + _HOPELESS:
+            if cost > fits[0].cost + _PRUNE_CHI2:
                 if math.isfinite(cost):
-                    hopeless.append((cost, R))
+                    pruned.append((cost, R))
                 continue
         fit = _refine(moments, model, R, p, 0.0, config, enough=0.05)
         if fit is not None and fit.R[2, 2] > 0:
             if not any(np.linalg.norm(frames.rotation_vector(fit.R.T @ other.R)) < 1e-3 for other in fits):
                 fits.append(fit)
-    return sorted(fits, key=lambda fit: fit.cost), hopeless
+    return sorted(fits, key=lambda fit: fit.cost), pruned
 
 
 def _moved_to_fit(moments: _Moments, model: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
@@ -758,7 +838,7 @@ def _paper(
     """The closed form, and its covariance by propagating the sides' offsets and angles; or why there is none."""
     X_CL = [view.X_CL for view in views]
 
-    def pose(lines: list[np.ndarray]):
+    def pose(lines: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
         return closed_form([meet(line) for line in lines], X_CL, model, config.fine_step)
 
     lines = [view.lines for view in views]
@@ -783,6 +863,17 @@ def _paper(
                 if there is None:
                     return None, None, "the closed form has no solution nearby"
                 columns.append(np.append(frames.rotation_vector(R.T @ there[0]), there[1] - p))
+        if view.bias.any():
+            moved = [line.copy() for line in lines]
+            moved[c][:, 2] += view.bias / view.scale
+            there = pose(moved)
+            if there is None:
+                return None, None, "the closed form has no solution nearby"
+            columns.append(np.append(frames.rotation_vector(R.T @ there[0]), there[1] - p))
+    if config.fine_step == "paper":  # the printed step has a bias of its own, which the exact one shows
+        exact = closed_form([meet(line) for line in lines], X_CL, model, "exact")
+        if exact is not None:
+            columns.append(np.append(np.zeros(3), exact[1] - p))
     J = np.array(columns)
     fit = _Fit(R=R, p=p, yaw=0.0, cost=0.0, information=np.eye(6), prior=np.zeros(6))
     return fit, J.T @ J, ""
@@ -796,6 +887,12 @@ def _gate(views: list[_View], fit: _Fit, residual: float, config: RectangleEstim
     distance = math.hypot(*fit.p)
     if not np.isfinite(distance) or fit.p[2] <= 0:
         return "behind the camera"
+    if len(views) == 2:
+        off = views[1].focal * float(
+            np.linalg.norm(epipolar_offset(views[0].corners, views[1].corners, frames.inverse(views[1].X_CL)))
+        )
+        if off > config.epipolar_gate or (residual > config.max_residual and off > residual):
+            return f"epipolar: {off:.1f} px"
     # The closed form's own bias leaves residuals that say nothing about the edges.
     if residual > config.max_residual * (5 if config.method == "paper" else 1):
         return f"residual {residual:.2f} px"

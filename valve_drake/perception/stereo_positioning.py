@@ -109,16 +109,24 @@ def locate(
 
 def single(
     candidates: tuple[MarkerCandidate, ...], lens: LensModel, marker: Marker, config: StereoPositioningConfig
-) -> int:
-    """Index of the accepted candidate that one camera alone takes for the marker, or -1: the best of those whose
-    corners fit the rectangle at a plausible distance."""
+) -> tuple[int, str]:
+    """The accepted candidate that one camera alone takes for the marker, the best of those whose corners fit the
+    rectangle at a plausible distance: its index and "", or -1 and why there is none."""
     rectangles = _rectangles(marker)
+    reason = "no candidate in the image"
     for k, candidate in enumerate(candidates):
-        if not candidate.rejected:
-            for depth, misfit in _coarse_fit(candidate, lens, rectangles).by_size:
-                if misfit < _shape_gate(candidate.area, config) and config.min_distance < depth < config.max_distance:
-                    return k
-    return -1
+        if candidate.rejected:
+            continue
+        fits = _coarse_fit(candidate, lens, rectangles).by_size
+        for depth, misfit in fits:
+            if misfit < _shape_gate(candidate.area, config) and config.min_distance < depth < config.max_distance:
+                return k, ""
+        if reason.startswith("no candidate"):  # of the best one
+            depth, misfit = min(fits, key=lambda fit: fit[1])
+            far = misfit < _shape_gate(candidate.area, config)
+            wrong = f"distance: {depth:.2f} m" if far else f"shape: corners off by {misfit:.2f} of its size"
+            reason = f"candidate {k}: {wrong}"
+    return -1, reason
 
 
 def triangulate(
@@ -170,6 +178,14 @@ def wrong_size(
     if not off <= config.side_gate + (config.side_sigma + head.rms_px) * per_pixel / min(x, y):
         return f"sides: {1000 * lengths[0]:.0f} x {1000 * lengths[1]:.0f} mm"
     return ""
+
+
+def epipolar_offset(left: np.ndarray, right: np.ndarray, X_LR: np.ndarray) -> np.ndarray:
+    """By how much the middle of right corners (4, 2) is off the epipolar line of the left ones', all ideal: (2,) in
+    the right image."""
+    a, b = (np.append(corners.mean(0), 1.0) for corners in (left, right))
+    line = X_LR[:, :3].T @ frames.cross(X_LR[:, 3], a)
+    return line[:2] * (line @ b) / max(line[:2] @ line[:2], 1e-300)
 
 
 def turn_between(left: np.ndarray, right: np.ndarray) -> int:
