@@ -1,7 +1,6 @@
 """Hand-eye calibration: the arm's noise and the corners' told apart, and poses that belong elsewhere refused."""
 
 import json
-import pathlib
 import re
 
 import boards
@@ -140,7 +139,9 @@ def command(tmp_path, monkeypatch, capsys):
     rng, true = np.random.default_rng(8), hand_poses(12)
     corners = [board_seen(X, 0.2, rng) for X in true]
     given = scattered(true, 0.1, 1.0, rng)
-    paths = [(pathlib.Path(f"{k}.png"),) for k in range(12)]
+    paths = [(tmp_path / f"{k}.png",) for k in range(12)]
+    for (path,) in paths:
+        path.touch()
     monkeypatch.setattr(
         hand_eye_report, "look", lambda *_: Pictures(paths, [(px,) for px in corners], (PAPER.width, PAPER.height))
     )
@@ -150,9 +151,13 @@ def command(tmp_path, monkeypatch, capsys):
         poses = change(given)
         rows = [{"image": f"{k}.png", "X_BE": np.vstack([X, [0, 0, 0, 1]]).tolist()} for k, X in enumerate(poses)]
         (tmp_path / "poses.json").write_text(json.dumps(rows))
-        files = {"--images": "*.png", "--poses": tmp_path / "poses.json", "--camera": tmp_path / "camera.yaml"}
+        files = {
+            "--images": tmp_path / "*.png",
+            "--poses": tmp_path / "poses.json",
+            "--camera": tmp_path / "camera.yaml",
+        }
         sizes = ["--board", board, "--pitch", "25x25", "--out", str(tmp_path / "hand.yaml"), "--json", *more]
-        code = main(["calibrate", "hand-eye", *(str(word) for pair in files.items() for word in pair), *sizes])
+        code = main(["calibrate", "hand-eye", *given_files, *sizes])
         out, err = capsys.readouterr()
         return code, json.loads(out) if out else {}, err
 

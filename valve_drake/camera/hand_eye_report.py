@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from valve_drake import frames, outputs, yaml_file
+from valve_drake import frames
 from valve_drake.camera import hand_eye as solver
 from valve_drake.camera import hand_eye_mistakes as mistakes
 from valve_drake.camera import hand_eye_page
@@ -29,17 +29,11 @@ def hand_eye(
     out: Path,
     camera: Path | None = None,
     to_hand: bool = False,
-    html: Path | None = None,
 ) -> Report:
     """The camera on the hand (X_EC), or beside the robot (X_BC), from images and hand poses paired by name.
 
-    Writes `out`, and the page to `html`. Raises ConfigError, and writes nothing, for poses that do not belong to the
-    images.
+    Writes `out`. Raises ConfigError, and writes nothing, for poses that do not belong to the images.
     """
-    inputs = [poses, *([camera] if camera else [])]
-    outputs.check(out, "--out", inputs, _is_hand_eye)
-    if html:
-        outputs.check(html, "--html", [*inputs, out], _is_page)
     X_BE = read_poses(poses)
     pictures = look(board, (images,), ("--images",))
     lens = load_calibration([camera]) if camera else calibrated(pictures, board, "opencv", None).fit.lenses[0]
@@ -77,8 +71,6 @@ def hand_eye(
     numbers |= {"not_used": sorted({name for which in missing.values() for name in which}), "warnings": notes}
     report = Report(finite(numbers), hand_eye_page.page(numbers, corners, pictures.size), _text(numbers))
     save_camera(lens, out, f"{key}: the camera in {where} (rows of [R | p; 0 0 0 1], m)", **{key: X})
-    if html:
-        outputs.write(html, report.page)
     return report
 
 
@@ -155,20 +147,6 @@ def _warnings(result: solver.HandEye, board: Board) -> list[str]:
             "more views, turned by 30 deg or more about two axes"
         )
     return out
-
-
-def _is_hand_eye(path: Path) -> bool:
-    """Whether a file is a calibration of this command, which it may replace."""
-    try:
-        data = yaml_file.read(path)
-    except ConfigError:
-        return False
-    return isinstance(data, dict) and set(data) in ({"camera", "X_EC"}, {"camera", "X_BC"})
-
-
-def _is_page(path: Path) -> bool:
-    with path.open("rb") as file:
-        return b"<title>Hand-eye calibration" in file.read(200)
 
 
 def _some(names: Sequence[str]) -> str:

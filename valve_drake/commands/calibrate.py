@@ -42,21 +42,21 @@ def command(options: argparse.Namespace) -> int:
     from valve_drake.camera.board import parse_board
 
     board = parse_board(options.board, options.pitch)
+    _check_outputs(options)
     if options.kind == "hand-eye":
         from valve_drake.camera import hand_eye_report
 
         report = hand_eye_report.hand_eye(
-            options.images, options.poses, board, options.out, options.camera, options.eye_to_hand, options.html
+            options.images, options.poses, board, options.out, options.camera, options.eye_to_hand
         )
     else:
-        _check_outputs(options)
         distances = None if options.distances is None else _millimetres(options.distances)
         if options.kind == "stereo":
             report = reports.stereo(options.left, options.right, board, options.out, options.lens, distances)
         else:
             report = reports.intrinsics(options.images, board, options.out, options.lens, distances)
-        if options.html:
-            outputs.write(options.html, report.page)
+    if options.html:
+        outputs.write(options.html, report.page)
     print(json.dumps(report.numbers) if options.json else "\n".join(report.lines()))
     return OK
 
@@ -69,6 +69,8 @@ def _check_outputs(options: argparse.Namespace) -> None:
 
     keys = ("left", "right") if options.kind == "stereo" else ("images",)
     inputs = [path for key in keys for path in find_images(getattr(options, key), f"--{key}")]
+    if options.kind == "hand-eye":
+        inputs += [options.poses, *([options.camera] if options.camera else [])]
     outputs.check(options.out, "--out", inputs, made_before=is_own)
     if options.html:
         outputs.check(options.html, "--html", [*inputs, options.out], made_before=is_page)
