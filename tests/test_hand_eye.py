@@ -151,11 +151,8 @@ def command(tmp_path, monkeypatch, capsys):
         poses = change(given)
         rows = [{"image": f"{k}.png", "X_BE": np.vstack([X, [0, 0, 0, 1]]).tolist()} for k, X in enumerate(poses)]
         (tmp_path / "poses.json").write_text(json.dumps(rows))
-        files = {
-            "--images": tmp_path / "*.png",
-            "--poses": tmp_path / "poses.json",
-            "--camera": tmp_path / "camera.yaml",
-        }
+        files = {"--images": "*.png", "--poses": "poses.json", "--camera": "camera.yaml"}
+        given_files = [str(word) for key, name in files.items() for word in (key, tmp_path / name)]
         sizes = ["--board", board, "--pitch", "25x25", "--out", str(tmp_path / "hand.yaml"), "--json", *more]
         code = main(["calibrate", "hand-eye", *given_files, *sizes])
         out, err = capsys.readouterr()
