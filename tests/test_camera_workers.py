@@ -7,6 +7,7 @@ import pytest
 
 from valve_drake import resources, scenario
 from valve_drake.camera.lens import load_head
+from valve_drake.checks import OperationFailed
 from valve_drake.stations.camera_rig import CameraRig, Capture
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.simulated import make_mounts
@@ -81,7 +82,7 @@ def test_the_processes_end_with_the_block_and_a_lost_one_is_named(rig, rig_argum
         processes[0].kill()
         if gone:  # before it is asked, else while it is
             processes[0].wait()
-        with pytest.raises(RuntimeError, match="renders head_left ended with code -9"):
+        with pytest.raises(OperationFailed, match="renders head_left ended with code -9"):
             workers.frame("head_left", captures(rig, 1)[0])
     assert all(process.poll() is not None for process in processes)
     gc.collect()  # what is left of a failed call must not take the program with it

@@ -42,7 +42,7 @@ def test_a_folder_is_no_file(tmp_path, monkeypatch, name):
     (tmp_path / "folder").mkdir()
     with pytest.raises(ConfigError, match=r"^--out must be "):
         outputs.check(name, "--out", overwrite=True)
-    with pytest.raises(ConfigError):
+    with pytest.raises(OperationFailed):
         outputs.write(name, "text")
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
@@ -61,7 +61,7 @@ def test_only_a_regular_file_is_written(tmp_path):
         (tmp_path / "link").symlink_to(tmp_path / "pipe")
         for name in ("pipe", "socket", "link"):
             refused("regular file", tmp_path / name, overwrite=True)
-            with pytest.raises(ConfigError, match="regular file"):
+            with pytest.raises(OperationFailed, match="regular file"):
                 outputs.write(tmp_path / name, "text")
     assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode) and (tmp_path / "link").is_symlink()
 

@@ -339,7 +339,12 @@ def test_what_is_no_log_of_a_run_is_refused_in_one_line(path, tmp_path, capsys):
         (["--set", "simulation.valve.height=1"], "it is recorded"),
         (["--set", "base_approach.hurry=1"], "unknown key base_approach.hurry"),
         (["--set", "base_approach.speed=-1"], "base_approach.speed"),
+        (["--set", "'seed'=5"], "unknown key"),
+        (["--set", "rectangle_estimator.method=paper\nseed: 5"], "not YAML"),
         (["--log", "{path}"], "another file"),
+        (["--log", "{path}.json"], "ends in .mcap"),
+        (["--log", ""], "--log must be"),
+        (["--log", "/"], "--log must be"),
     ],
 )
 def test_a_replay_that_makes_no_sense_is_refused_in_one_line(arguments, words, path, capsys):

@@ -1,12 +1,18 @@
 """Whole runs of the system: short ones here, long ones marked slow."""
 
+import contextlib
 import hashlib
 import json
+import os
+import re
+import signal
+import socket
 
 import pytest
 
 from valve_drake import cli, runner
 from valve_drake import scenario as scenarios
+from valve_drake.checks import OperationFailed
 from valve_drake.messages import Mode
 from valve_drake.recording.reader import LogReader
 
@@ -95,13 +101,169 @@ def test_an_operators_stop_ends_the_run_still_and_stopped(tmp_path):
     assert all(v == 0 for v in twist.values())
 
 
-def test_a_full_disk_stops_the_log_and_not_the_run(tmp_path, monkeypatch):
+def command(capsys, *arguments):
+    """`valve-drake run` with a near start -> exit code, what it prints, what it says."""
+    quick = [word for key in QUICK for word in ("--set", key)]
+    code = cli.main(["run", "--no-html", *quick, *arguments])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def full_disk(monkeypatch):
     def full(_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    result = run(tmp_path / "full.mcap", ["seed=4"], duration=1.0)
-    assert "No space left" in result.log_error
+
+
+def test_a_full_disk_stops_the_log_and_not_the_run(tmp_path, monkeypatch):
+    full_disk(monkeypatch)
+    said = []
+    result = run(tmp_path / "full.mcap", ["seed=4"], duration=1.0, say=said.append)
+    assert "No space left" in result.log_error and said == [result.log_error]
+    assert result.log == tmp_path / "full.mcap.active"
+    assert result.summary.sim_time_s == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_full_disk_is_said_in_one_line_and_the_verdict_is_shown(here, capsys, monkeypatch):
+    full_disk(monkeypatch)
+    code, out, err = command(capsys, "--duration", "0.2", "--log", "full.mcap")
+    assert code == 1 and "verdict" in out
+    assert err.count("\n") == 1 and err.startswith("valve-drake: logging stopped: No space left on device; ")
+
+
+def test_a_log_folder_that_is_moved_in_mid_run_keeps_the_log_and_the_verdict(tmp_path):
+    def move(progress):
+        if progress.sim_time == 0.0:
+            (tmp_path / "logs").rename(tmp_path / "logs2")
+
+    result = run(tmp_path / "logs" / "a.mcap", ["seed=4"], duration=0.2, show=move)
+    assert "was moved or removed" in result.log_error and result.log == tmp_path / "logs2" / "a.mcap.active"
+    assert result.summary.spans and result.summary.verdict == ""
+    assert LogReader(result.log).metadata["result"]["outcome"] == "unfinished"
+
+
+def test_a_rendering_process_that_is_killed_ends_the_run_with_a_verdict_and_a_whole_log(here, capsys, monkeypatch):
+    start = runner.CameraWorkers.start
+
+    def kill_one(self, *rig):
+        start(self, *rig)
+        self._workers[0].process.kill()
+        return self
+
+    monkeypatch.setattr(runner.CameraWorkers, "start", kill_one)
+    code, out, err = command(capsys, "--duration", "2", "--log", "a.mcap", "--json")
+    result = json.loads(out)
+    assert code == 1 and (result["outcome"], result["verdict"]) == ("failed", "fault")
+    assert err == "valve-drake: the process that renders head_left ended with code -9\n"
+    assert result["reason"] in err and result["log"] == "a.mcap"
+    log = LogReader("a.mcap")
+    assert log.damage == [] and log.metadata["result"]["verdict"] == "fault"
+
+
+def test_a_second_run_of_one_seed_takes_the_next_name_and_says_so(here, capsys):
+    for name in ("run-4.mcap", "run-4-2.mcap"):
+        code, out, err = command(capsys, "--seed", "4", "--duration", "0.01", "--json")
+        assert code == 0 and json.loads(out)["log"] == f"logs/{name}"
+    assert err == "valve-drake: 'logs/run-4.mcap' exists: this log is 'logs/run-4-2.mcap'\n"
+    assert json.loads((here / "logs" / "run-4.json").read_text())["log"] == "logs/run-4.mcap"
+    names = {"run-4.mcap", "run-4.json", "run-4-2.mcap", "run-4-2.json"}
+    assert {path.name for path in (here / "logs").iterdir()} == names
+
+
+def test_a_log_that_was_named_and_exists_is_replaced_with_overwrite_only(here, capsys):
+    (here / "a.mcap").write_text("mine")
+    code, _, err = command(capsys, "--duration", "0.01", "--log", "a.mcap")
+    assert code == 2 and "--overwrite" in err and (here / "a.mcap").read_text() == "mine"
+    code, _, err = command(capsys, "--duration", "0.01", "--log", "a.mcap", "--overwrite")
+    assert code == 0 and err == "" and LogReader("a.mcap").damage == []
+
+
+@pytest.mark.parametrize("name", ["x.json", "y.html", "log", ".mcap", ".", "", "/", "x.mcap.active"])
+def test_a_log_is_named_mcap_so_that_what_lies_beside_it_has_another_name(here, capsys, name):
+    code, _, err = command(capsys, "--duration", "0.01", "--log", name)
+    assert code == 2 and err.startswith("valve-drake: --log must be ") and err.count("\n") == 1
+    assert list(here.iterdir()) == []
+
+
+def test_what_lies_beside_a_log_is_not_replaced_either(here, capsys):
+    (here / "a.json").write_text("mine")
+    code, _, err = command(capsys, "--duration", "0.01", "--log", "a.mcap")
+    assert code == 2 and "got 'a.json'" in err and (here / "a.json").read_text() == "mine"
+
+
+@pytest.mark.parametrize("refusal", ["taught", "no robot"])
+def test_a_refused_run_leaves_no_file_and_touches_none(here, capsys, refusal, monkeypatch):
+    def silence(_):
+        raise OperationFailed("the robot does not answer")
+
+    (here / "logs").mkdir()
+    (here / "logs" / "run-0.mcap").write_text("older")
+    (here / "wrong.yaml").write_text("neither: hand\n")
+    if refusal == "taught":
+        code, _, err = command(capsys, "--set", "taught=wrong.yaml")
+        assert code == 2 and "wrong.yaml" in err
+    else:
+        monkeypatch.setattr(runner.RobotLink, "start", silence)
+        code = cli.main(["run", "hardware.scenario.yaml", "--set", "hardware.lcm_url=memq://"])
+        err = capsys.readouterr().err
+        assert code == 1 and "robot" in err
+    assert {path.name for path in here.rglob("*")} == {"logs", "run-0.mcap", "wrong.yaml"}
+    assert (here / "logs" / "run-0.mcap").read_text() == "older"
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+def test_a_signal_is_the_operators_stop_and_the_log_is_whole(here, capsys, number, monkeypatch):
+    advance = runner._advance
+
+    def told(system, simulator, scenario, duration, go, link, show, stop, begin):
+        def signalled(progress):
+            if progress.sim_time == 0.0:
+                os.kill(os.getpid(), number)
+            show(progress)
+
+        stop()  # somebody looks
+        return advance(system, simulator, scenario, duration, go, link, signalled, stop, begin)
+
+    monkeypatch.setattr(runner, "_advance", told)
+    code, out, err = command(capsys, "--log", "a.mcap")
+    assert code == 1 and "verdict stopped" in out and err == ""
+    log = LogReader("a.mcap")
+    assert log.damage == [] and log.metadata["result"]["outcome"] == "stopped"
+
+
+def test_a_run_that_fails_within_its_duration_exits_1(here, capsys):
+    away = ["--set", "supervisor.deadline.search=1", "--set", "simulation.start.heading=2.0"]
+    code, out, _ = command(capsys, "--duration", "1.1", "--log", "a.mcap", *away)
+    assert code == 1 and "failed  verdict timeout" in out
+
+
+def test_a_name_that_is_not_utf8_is_written_and_shown(here, capsys):
+    name = os.fsdecode(b"caf\xe9.mcap")
+    code, out, err = command(capsys, "--duration", "0.01", "--log", name)
+    assert code == 0 and "log caf\\udce9.mcap" in out and err == ""
+    assert json.loads((here / name).with_suffix(".json").read_text())["log"] == name
+
+
+def test_brackets_in_a_name_are_no_markup(here, capsys):
+    code, out, _ = command(capsys, "--duration", "0.01", "--log", "z[/b].mcap")
+    assert code == 0 and "log z[/b].mcap" in out
+
+
+def test_the_3d_view_takes_the_next_free_port_and_says_which(here, capsys):
+    with socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        with contextlib.suppress(OSError):  # somebody else has it: as good
+            taken.bind(("127.0.0.1", 7000))
+            taken.listen()
+        code, _, err = command(capsys, "--duration", "0.01", "--log", "a.mcap", "--meshcat")
+    assert code == 0 and re.fullmatch(r"valve-drake: 3D view at http://\S+:70\d\d \(port 7000 is taken\)\n", err)
 
 
 @pytest.mark.parametrize(
@@ -114,6 +276,8 @@ def test_a_full_disk_stops_the_log_and_not_the_run(tmp_path, monkeypatch):
         (["run", "--seed", "x"], "--seed"),
         (["run", "--duration", "nan"], "--duration"),
         (["run", "--command", "push"], "push"),
+        (["run", "--live", "--live-port", "65536"], "--live-port must be within [0, 65535], got 65536"),
+        (["run", "--live", "--live-port", "-1"], "--live-port"),
         (["fly"], "fly"),
         ([], "COMMAND"),
         (["recover", "nowhere.mcap", "-o", "x.mcap"], "nowhere.mcap"),
@@ -140,7 +304,7 @@ def test_run_json_prints_one_object(tmp_path, capsys, monkeypatch):
 @pytest.mark.slow
 def test_the_whole_work_turns_the_valve(tmp_path):
     html = tmp_path / "whole.html"
-    result = runner.run(scenarios.load(None, ["seed=1"]), tmp_path / "whole.mcap", html=html)
+    result = runner.run(scenarios.load(None, ["seed=1"]), tmp_path / "whole.mcap", recording=True)
     s = result.summary
     assert (s.outcome, s.verdict) == ("done", "turned")
     assert s.angle_true_rad == pytest.approx(s.command_rad, abs=0.035)

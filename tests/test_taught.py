@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from valve_drake import resources
+from valve_drake import cli, resources
 from valve_drake.behaviors.taught import TaughtReference, load_taught, save_taught
 from valve_drake.checks import ConfigError
 from valve_drake.messages import LEFT, RIGHT, SIDES
@@ -101,3 +101,15 @@ def test_a_file_that_is_not_there_or_no_yaml_is_refused_in_one_line(tmp_path):
         with pytest.raises(ConfigError) as error:
             load_taught(path)
         assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_foreign_file_is_neither_shown_nor_kept(tmp_path, capsys):
+    """A scenario's `taught` could name any file of the machine: the error does not print it, no log attaches it."""
+    secret = tmp_path / "secret"
+    secret.write_text("root:x:0:0\ndaemon:x:1:1\n")
+    log = tmp_path / "run.mcap"
+    for name in ("taught", "head_calibration"):
+        assert cli.main(["run", "--set", f"{name}={secret}", "--duration", "0.01", "--log", str(log), "--no-html"]) == 2
+        said = capsys.readouterr()
+        assert "daemon" not in said.out + said.err and said.err.count("\n") == 1 and str(secret) in said.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["secret"]

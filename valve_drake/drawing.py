@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pydrake.systems.framework import Diagram
 
+from valve_drake import outputs
 from valve_drake.diagram import make_diagram, wiring
 from valve_drake.scenario import Scenario, resolve
 
@@ -40,18 +41,34 @@ KINDS = {
 BEHAVIOR = "#1f5f8b"
 WIDTH, HEIGHT, COLUMN, ROW, LEFT, TOP = 158, 46, 222, 92, 24, 40
 TO_ALL = {"status": "#6a4c93", "command": "#37474f"}  # ports that every behaviour has: coloured, not labelled
+CAPTION = "One arrow for all ports between two blocks."
 BUSES = {"supervisor.mode": "#6a4c93", "robot_state.robot_state": "#546e7a", "station.health": "#c77d0a"}
 
 
+def files(name: str) -> tuple[str, str]:
+    """The names of the wiring list and of the drawing."""
+    return f"{name}.wiring.txt", f"{name}.svg"
+
+
+def made_before(path: Path) -> bool:
+    """Whether a file is a wiring list or a drawing by `write`."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+    if path.suffix == ".svg":
+        return CAPTION in text
+    return bool(text) and all(" -> " in line for line in text.splitlines())
+
+
 def write(scenario: Scenario, name: str, folder: Path) -> list[Path]:
-    """Writes <name>.wiring.txt and <name>.svg."""
+    """Writes <name>.wiring.txt and <name>.svg -> their paths. Raises OperationFailed."""
     diagram = make_diagram(resolve(scenario)).diagram
-    folder.mkdir(parents=True, exist_ok=True)
-    out = []
-    for path, text in ((folder / f"{name}.wiring.txt", wiring_text(diagram)), (folder / f"{name}.svg", svg(diagram))):
-        path.write_text(text, encoding="utf-8")
-        out.append(path)
-    return out
+    outputs.make_folder(folder)
+    paths = [folder / file for file in files(name)]
+    for path, text in zip(paths, (wiring_text(diagram), svg(diagram))):
+        outputs.write(path, text)
+    return paths
 
 
 def wiring_text(diagram: Diagram) -> str:
@@ -79,7 +96,7 @@ def svg(diagram: Diagram) -> str:
         '<defs><marker id="a" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
         '<path d="M0 0L8 4L0 8z" fill="#607d8b"/></marker></defs>',
         f'<rect width="{width}" height="{height}" fill="#fbfbf8"/>',
-        f'<text x="{LEFT}" y="28" font-size="13" fill="#607d8b">One arrow for all ports between two blocks. Squares: '
+        f'<text x="{LEFT}" y="28" font-size="13" fill="#607d8b">{CAPTION} Squares: '
         "reads the mode (purple), the robot's state (grey), its health (amber). "
         "Arrows: status (purple), command (dark).</text>",
     ]

@@ -86,9 +86,12 @@ def write(path: PathLike, data: bytes | str) -> None:
 def replacing(path: PathLike) -> Iterator[IO[bytes]]:
     """A new file to write to, which becomes `path` on leaving without an exception; else no trace of it is left.
 
-    Raises OperationFailed if the disk refuses, ConfigError for what is no regular file.
+    Raises OperationFailed if it cannot be, also for what is no regular file.
     """
-    target, _ = _target(path, "output")
+    try:
+        target, _ = _target(path, "output")
+    except ConfigError as error:  # the work is done: what `check` has passed has changed since
+        raise OperationFailed(str(error)) from None
     temporary = target.with_name(f".valve-drake-{secrets.token_hex(8)}.tmp")
     try:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)

@@ -21,19 +21,18 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
-from valve_drake import config, resources, yaml_file
+from valve_drake import config, outputs, resources, yaml_file
 from valve_drake.analysis.comparison import Comparison
 from valve_drake.analysis.metrics import Summary, summarize
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.camera.lens import load_head
-from valve_drake.checks import ConfigError, require
+from valve_drake.checks import ConfigError, OperationFailed, require
 from valve_drake.config import key_names
 from valve_drake.diagram import System, command, make_diagram
-from valve_drake.messages import Mode, ModeState, OperatorCommand
+from valve_drake.messages import Mode, ModeState, OperatorCommand, Verdict
 from valve_drake.pace import PACE, Pace, Pacer
 from valve_drake.ports import SLOT, TICK, profile
 from valve_drake.recording import layout
-from valve_drake.recording.container import active
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recorder_system import RecorderSystem, Sink, Tee
 from valve_drake.recording.robot_frames import RobotFrames, pinholes
@@ -57,8 +56,10 @@ from valve_drake.stations.replay import Recording
 
 STEP = 1 / 32  # between two looks at the mode [s]
 TAIL = 1.5  # recorded after the end: a stopped base takes a second to stand [s]
+VIEW_PORT = 7000  # that Drake's 3D view tries first
 TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
-FILES = {key: f"{key}.yaml" for key in ("head_calibration", "taught")}  # that a scenario names, as attached to its log
+READERS = {"head_calibration": load_head, "taught": load_taught}  # of the files that a scenario names
+FILES = {key: f"{key}.yaml" for key in READERS}  # the same, as attached to its log
 WORLD = ("simulation", "hardware", "faults")
 RECORDED = ("seed", "station", "command", "angle", "time_limit", *WORLD)  # keys that a replay cannot change
 
@@ -76,11 +77,13 @@ class Progress:
 class Result:
     """What a run came to."""
 
-    summary: Summary
+    summary: Summary  # its outcome and verdict are the supervisor's, its numbers those of what was logged
     wall_time: float  # of the run itself [s]
-    log: Path
+    name: Path  # of the log; what belongs to it has the same name with another suffix
+    log: Path | None  # where the log is; None if it was removed
     html: Path | None
-    log_error: str
+    log_error: str  # why logging stopped; `say` was told
+    troubles: tuple[str, ...]  # what else went wrong, in lines for the user
     shares: dict[str, float]  # of the wall time, by kind of work; of rendering, what the run waited for
     beside: float  # processor time of rendering beside the run [s]
     pace: Pace | None  # how real time was kept, where it was
@@ -108,7 +111,7 @@ class Result:
             "shares": {kind: round(share, 4) for kind, share in self.shares.items()},
             "rendering_beside_s": self.beside,
             "pace": self.pace and self.pace.as_json(),
-            "log": str(self.log),
+            "log": str(self.log) if self.log else None,
             "log_error": self.log_error,
             "recording": str(self.html) if self.html else None,
         }
@@ -144,75 +147,146 @@ def run(
     scenario: Scenario,
     log: Path,
     *,
-    html: Path | None = None,
-    meshcat_port: int | None = None,
+    overwrite: bool = False,
+    recording: bool = False,
+    meshcat: bool = False,
     truth: bool = True,
     duration: float | None = None,
     live: Sink | None = None,
     link: RobotLink | None = None,
     show: Callable[[Progress], None] = lambda progress: None,
+    say: Callable[[str], None] = lambda line: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Result:
     """Runs a scenario (distributions and all) and writes its log.
 
-    html: where to put the 3D recording. meshcat_port: also serve it live there. truth: record the truth ports.
+    log: its name; the next free one is taken if it exists (recording/active.py). overwrite: it may be replaced.
+    recording: puts a 3D recording beside the log. meshcat: serves it live. truth: records the truth ports.
     duration: stop then, whatever the mode [s]. live: also gets all that is logged. link: to the robot of
-    station `hardware`, else made of the scenario. show: called every STEP.
+    station `hardware`, else made of the scenario. show: called every STEP. say: told what the user should know.
     stop: True makes the operator's stop.
+    Raises ConfigError, OperationFailed before the first message is logged, and leaves no file then. What goes wrong
+    later is in the result.
     """
     scenario = resolve(scenario)
     scenario.check()
     require(scenario.station != "replay", "station", "one that runs (a log is replayed by `replay LOG`)", "replay")
     files = _read_files(scenario)  # before anything is opened: a scenario that cannot be run leaves no trace
     cv2.setNumThreads(1)  # the same bits on any machine, and the renderer wants the cores
-    meshcat = None
     if scenario.station == "hardware":
-        html = meshcat_port = None  # the simulation's views: a robot is looked at itself
+        recording = meshcat = False  # 3D views exist in simulation only
         link = link or RobotLink(Bus(scenario.hardware), stop=stop)
-    if html is not None or meshcat_port is not None:
-        meshcat = Meshcat(MeshcatParams(host="localhost", port=meshcat_port))
-        meshcat.SetCameraPose(np.array([-5.2, -3.6, 2.7]), np.array([-1.4, 0.1, 0.8]))  # start and valve in view
+    view = _make_view(say if meshcat else None) if recording or meshcat else None
     profile.clear()
-    writer = LogWriter(log)
+    writer = LogWriter(log, companions=(".json", ".html") if recording else (".json",), overwrite=overwrite)
+    troubles = []
     with _log_kept(writer), CameraWorkers() as workers:
+        if writer.note:
+            say(writer.note)
         _begin_log(writer, scenario, files)
         sink = writer if live is None else Tee(writer, live)
         recorder = make_recorder(sink, scenario)
-        system = make_diagram(scenario, recorder, meshcat=meshcat, workers=workers, link=link, truth=truth)
+        system = make_diagram(scenario, recorder, meshcat=view, workers=workers, link=link, truth=truth)
         simulator = Simulator(system.diagram)
-        if html is not None:
-            meshcat.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat_port is not None)
+        if recording:
+            view.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat)
         begin = time.perf_counter()
         paced = scenario.station == "hardware" and not scenario.hardware.lockstep
         pacer = Pacer(idle=link.pass_time) if paced else None
         go = simulator.AdvanceTo if pacer is None else _in_real_time(simulator, pacer, sink)
-        mode = _advance(system, simulator, scenario, duration, go, link, show, stop, begin)
-        wall = time.perf_counter() - begin
-        writer.write_metadata("result", _result_metadata(mode, simulator.get_context().get_time()))
-    if html is not None:
-        meshcat.StopRecording()
-        meshcat.PublishRecording()
-        html.write_text(meshcat.StaticHtml(), encoding="utf-8")
+        last, told = Progress(ModeState(), 0.0, 0.0), False
+
+        def watch(progress: Progress) -> None:
+            nonlocal last, told
+            last = progress
+            show(progress)
+            if writer.error and not told:
+                told = True
+                say(writer.error)
+
+        try:
+            mode = _advance(system, simulator, scenario, duration, go, link, watch, stop, begin)
+        except OperationFailed as error:
+            if writer.empty:
+                raise
+            mode = dc.replace(last.mode, mode=Mode.FAILED, verdict=Verdict.FAULT, reason=str(error))
+            troubles.append(str(error))
+        wall, end = time.perf_counter() - begin, simulator.get_context().get_time()
+        writer.write_metadata("result", _result_metadata(mode, end))
+    if writer.error and not told:
+        say(writer.error)
+    html = _write_recording(view, writer, troubles) if recording else None
     shares = {kind: seconds / wall for kind, seconds in profile.seconds.items()}
     shares["physics"] = 1.0 - sum(shares.values())
-    written = log if not writer.error else active(log)
     pace = pacer and pacer.report(mode.time)
-    return Result(summarize(written), wall, written, html, writer.error, shares, profile.render_worker_seconds, pace)
+    summary = _summary(writer, mode, end)
+    return Result(
+        summary,
+        wall,
+        writer.path,
+        writer.where,
+        html,
+        writer.error,
+        tuple(troubles),
+        shares,
+        profile.render_worker_seconds,
+        pace,
+    )
 
 
 def _read_files(scenario: Scenario) -> dict[str, bytes]:
     """The files that a scenario names, by the name under which a log holds them. Raises ConfigError unless each is
     what it should be: nothing else of a user's files gets into a log."""
     files = {}
-    for key, load in (("head_calibration", load_head), ("taught", load_taught)):
+    for key, load in READERS.items():
         path = resources.find(getattr(scenario, key), resources.models())
         load(path)
         files[FILES[key]] = path.read_bytes()
     return files
 
 
+def _make_view(say: Callable[[str], None] | None) -> Meshcat:
+    """Drake's 3D view at the first free port; `say` tells which."""
+    try:
+        view = Meshcat(MeshcatParams(host="localhost", port=None))
+    except RuntimeError as error:
+        raise OperationFailed(f"the 3D view finds no free port: {str(error).splitlines()[0]}") from error
+    view.SetCameraPose(np.array([-5.2, -3.6, 2.7]), np.array([-1.4, 0.1, 0.8]))  # start and valve in view
+    if say is not None:
+        taken = "" if view.port() == VIEW_PORT else f" (port {VIEW_PORT} is taken)"
+        say(f"3D view at {view.web_url()}{taken}")
+    return view
+
+
+def _write_recording(view: Meshcat, writer: LogWriter, troubles: list[str]) -> Path | None:
+    """The 3D recording beside the log; None if it cannot be written."""
+    view.StopRecording()
+    view.PublishRecording()
+    path = writer.path.with_suffix(".html")
+    try:
+        outputs.write(path, view.StaticHtml())
+    except OperationFailed as error:
+        if not writer.error:  # else the disk has been complained of
+            troubles.append(str(error))
+        return None
+    return path
+
+
+def _summary(writer: LogWriter, mode: ModeState, end: float) -> Summary:
+    """The log's numbers, and how the run ended: also where the log, cut off, does not know it."""
+    try:
+        summary = summarize(writer.where) if writer.where else Summary()
+    except ConfigError:  # there is too little of it
+        summary = Summary()
+    summary.outcome = mode.mode if mode.mode in TERMINAL else ""
+    summary.verdict, summary.reason = mode.verdict, mode.reason
+    if writer.error:
+        summary.sim_time_s = end
+    return summary
+
+
 def _begin_log(writer: LogWriter, scenario: Scenario, files: Mapping[str, bytes], **facts: str) -> None:
-    """What every log begins with; `files`: to attach, by name."""
+    """What every log begins with; `files`: what the scenario names, to attach."""
     about = {"scenario": dump(scenario), "seed": str(scenario.seed), "station": scenario.station}
     writer.write_metadata("run", about | versions() | facts)
     writer.attach(layout.NAME, layout.MEDIA_TYPE, json.dumps(layout.layout(), indent=1).encode())
@@ -310,6 +384,8 @@ class Replay:
     wall_time: float  # [s]
     damage: list[str]  # of the log, in lines
     notes: list[str]  # what may explain a difference
+    log: Path | None  # the replay's own, if it was asked for
+    log_error: str  # why its writing stopped
 
     @property
     def real_time_factor(self) -> float:
@@ -341,6 +417,8 @@ class Replay:
             },
             "damage": self.damage,
             "notes": self.notes,
+            "log": str(self.log) if self.log else None,
+            "log_error": self.log_error,
         }
 
 
@@ -349,12 +427,15 @@ def replay(
     overrides: Sequence[str] = (),
     *,
     copy: Path | None = None,
+    overwrite: bool = False,
     show: Callable[[Progress], None] = lambda progress: None,
+    say: Callable[[str], None] = lambda line: None,
 ) -> Replay:
     """Runs all blocks on what the log's station showed them, and compares what comes out with what was recorded.
 
-    overrides: other values of the log's scenario, as `key=value`. copy: writes the replay's own log there.
-    Raises ConfigError if this version of the program cannot replay the log, LogError if `copy` cannot be written.
+    overrides: other values of the log's scenario, as `key=value`. copy: writes the replay's own log there, or under the
+    next free name; overwrite, show, say: as of `run`.
+    Raises ConfigError if this version of the program cannot replay the log, or `copy` cannot be made.
     """
     recorded, notes = _recorded_scenario(log)
     changed = [split_override(override)[0] for override in overrides]
@@ -371,8 +452,10 @@ def replay(
         sink: Sink = comparison
         writer = None
         if copy is not None:
-            require(copy.resolve() != log.path.resolve(), "--log", "another file than the log itself", str(copy))
-            writer = stack.enter_context(LogWriter(copy))
+            writer = LogWriter(copy, overwrite=overwrite)
+            stack.enter_context(_log_kept(writer))
+            if writer.note:
+                say(writer.note)
             _begin_log(writer, scenario, data, replay_of=log.path.name)
             sink = Tee(comparison, writer)
         system = make_diagram(files, make_recorder(sink, files), recording=recording)
@@ -382,7 +465,9 @@ def replay(
         wall = time.perf_counter() - begin
         if writer is not None:
             writer.write_metadata("result", _result_metadata(mode, recording.end))
-    return Replay(comparison, recording.end, wall, log.damage, notes + _notes(log, recorded, recording, changed))
+    where, error = (writer.where, writer.error) if writer is not None else (None, "")
+    notes += _notes(log, recorded, recording, changed)
+    return Replay(comparison, recording.end, wall, log.damage, notes, where, error)
 
 
 def _recorded_scenario(log: LogReader) -> tuple[Scenario, list[str]]:

@@ -132,11 +132,10 @@ def with_overrides(scenario: Scenario, overrides: typing.Sequence[str]) -> Scena
     """The scenario with `key=value` overrides, checked. Raises ConfigError as `load` does."""
     for override in overrides:
         key, value = split_override(override)
-        source = f"--set {key}"
-        given = yaml_file.parse(value, source, TAGS)
+        given = yaml_file.parse(value, f"--set {key}", TAGS)
         for name in reversed(key.split(".")):
             given = {name: given}
-        scenario = config.build(scenario, given, source)
+        scenario = config.build(scenario, given, "--set")
     scenario.check()
     return scenario
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from valve_drake import resources
+from valve_drake import outputs, resources
 from valve_drake.behaviors.grasp_geometry import StanceConfig, best_arc, hand_in_valve
 from valve_drake.behaviors.taught import TaughtReference, save_taught
 from valve_drake.camera.lens import load_head
@@ -27,6 +27,9 @@ from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
 PROBE = 0.02  # of the hand to both sides along each of its axes [m]
 DISTANCE = 0.78  # base to the panel [m]
 IMAGES = 8  # averaged at every place
+REFERENCES, PICTURES = "hands.yaml", {side: f"{side}.png" for side in SIDES}
+FILES = (REFERENCES, *PICTURES.values())
+HEADING = "Made by `valve-drake teach`."
 
 
 def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.ndarray]]:
@@ -83,15 +86,25 @@ def _positions(rig: CameraRig, base: np.ndarray, arms: dict[str, np.ndarray], op
     return positions
 
 
+def made_before(path: Path) -> bool:
+    """Whether `write` has filled the folder of this file: its references say so."""
+    try:
+        with open(path.with_name(REFERENCES), "rb") as file:
+            return file.read(100).startswith(f"# {HEADING}".encode())
+    except OSError:
+        return False
+
+
 def write(scenario: Scenario, folder: Path) -> None:
-    """Teaches and writes hands.yaml, left.png and right.png into a folder."""
+    """Teaches and writes FILES into a folder. Raises ConfigError as `teach` does, OperationFailed."""
     taught, pictures = teach(scenario)
-    folder.mkdir(parents=True, exist_ok=True)
+    outputs.make_folder(folder)
     save_taught(
         taught,
-        folder / "hands.yaml",
-        "Made by `valve-drake teach`. For each hand at its handle, gripper open: feature (u, v, 1)/sqrt(area),\n"
+        folder / REFERENCES,
+        f"{HEADING} For each hand at its handle, gripper open: feature (u, v, 1)/sqrt(area),\n"
         "image Jacobian d feature / d hand translation [1/m] in its frame, the mark's area [px^2] and corners [px].",
     )
     for side, picture in pictures.items():
-        cv2.imwrite(str(folder / f"{side}.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        outputs.write(folder / PICTURES[side], data.tobytes())

@@ -76,7 +76,7 @@ def parse(text: str, source: str, tags: Tags | None = None) -> Tree:
     """
     trees = documents(text, source, tags)
     if len(trees) > 1:
-        raise ConfigError(f"{source}: must be one YAML document, got {len(trees)}")
+        raise ConfigError(f"{source} must be one YAML document, got {len(trees)}")
     return trees[0] if trees else None
 
 
@@ -144,7 +144,8 @@ class _Builder:
         return trees
 
     def error(self, event: yaml.Event, key: str, text: str) -> ConfigError:
-        return ConfigError(f"{self.source}: {key + ' ' if key else ''}{text} (line {event.start_mark.line + 1})")
+        subject = f"{self.source}: {key}" if key else self.source
+        return ConfigError(f"{subject} {text} (line {event.start_mark.line + 1})")
 
     def count(self, event: yaml.Event, more: int) -> None:
         self.values += more

@@ -14,7 +14,7 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -553,7 +553,7 @@ def run(name: str, seed: int = 0, trials: int | None = None) -> dict[str, Any]:
     return EXPERIMENTS[name](seed, trials)
 
 
-def plot_bound(result: dict[str, Any], path: Path) -> None:
+def plot_bound(result: dict[str, Any], file: Path | IO[bytes]) -> None:
     """Error over the bound by distance, a panel for one camera and one for two, and the honesty of the covariance."""
     import matplotlib
 
@@ -593,5 +593,5 @@ def plot_bound(result: dict[str, Any], path: Path) -> None:
     axes[2].set_xticks(distances, [f"{z:g}" for z in distances])
     axes[2].minorticks_off()
     axes[2].legend(fontsize=8, title="cameras")
-    figure.savefig(path, metadata={"Date": None})
+    figure.savefig(file, format="svg", metadata={"Date": None})
     plt.close(figure)

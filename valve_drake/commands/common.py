@@ -4,15 +4,19 @@ import argparse
 import contextlib
 import math
 import signal
-import sys
-from collections.abc import Callable, Iterator
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import NoReturn, TypeAlias
 
-from valve_drake.checks import ConfigError
+from valve_drake import outputs
+from valve_drake.checks import ConfigError, require
 from valve_drake.console import console as make_console
 from valve_drake.console import styled
 
 OK, FAILED, BAD_INPUT, DAMAGED = 0, 1, 2, 3  # exit codes
+ECHO = 0.3  # a signal again within this time is the same one: a closing terminal and `timeout` send theirs twice [s]
 Subcommands: TypeAlias = "argparse._SubParsersAction[Parser]"
 
 
@@ -45,22 +49,77 @@ def scenario_overrides(options: argparse.Namespace) -> list[str]:
     return overrides
 
 
+def check_log(
+    path: Path, option: str, overwrite: bool, inputs: Iterable[Path] = (), companions: Sequence[str] = ()
+) -> Path:
+    """The log to write for a name that the user gave: FILE.mcap, so that what lies beside it has another suffix.
+
+    companions: suffixes of files that will be written beside it. Raises ConfigError as outputs.check does.
+    """
+    inputs = tuple(inputs)
+    log = outputs.check(path, option, inputs, overwrite=overwrite, new_folders=True)
+    require(log.suffix == ".mcap", option, "a file name that ends in .mcap", path)
+    for suffix in companions:
+        outputs.check(log.with_suffix(suffix), f"{option} with {suffix}", inputs, overwrite=overwrite, new_folders=True)
+    return log
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal ends the command; what is open is completed on the way out."""
+
+    def __init__(self, number: int):
+        super().__init__(number)
+        self.exit_code = FAILED if number == signal.SIGINT else 128 + number
+
+
+@contextlib.contextmanager
+def signals(handle: Callable[[int], None]) -> Iterator[None]:
+    """SIGINT, SIGTERM and SIGHUP call `handle` with their number; but not SIGHUP where `nohup` has turned it off."""
+    if threading.current_thread() is not threading.main_thread():  # Python hands signals to that one only
+        yield
+        return
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    old = {number: signal.signal(number, lambda number, frame: handle(number)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+def break_off(number: int) -> None:
+    """What a signal does by default: it ends the command, but through its context managers: no half file stays."""
+    raise Interrupted(number)
+
+
 @contextlib.contextmanager
 def stopper() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C once is the operator's stop (the robot lets go and stands still), twice breaks off."""
-    count = [0]
+    """Ctrl-C, SIGTERM or SIGHUP once is the operator's stop (the robot lets go and stands still), twice breaks off.
 
-    def handle(*_: object) -> None:
-        count[0] += 1
-        if count[0] > 1:
-            raise KeyboardInterrupt
+    Before somebody has looked whether a stop is asked for, the first signal breaks off: nobody would heed it.
+    """
+    looked = broken = False
+    first: float | None = None  # signal, when [s]
 
-    old = signal.signal(signal.SIGINT, handle)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # leaves through the log's context manager
-    try:
-        yield lambda: count[0] > 0
-    finally:
-        signal.signal(signal.SIGINT, old)
+    def handle(number: int) -> None:
+        nonlocal first, broken
+        now = time.monotonic()
+        if broken or (first is not None and now - first < ECHO):
+            return
+        again, first = first is not None, first or now
+        if again or not looked:
+            broken = True  # only once: nothing must interrupt the log's completion
+            raise Interrupted(number)
+
+    def stop() -> bool:
+        nonlocal looked
+        looked = True
+        return first is not None
+
+    with signals(handle):
+        yield stop
 
 
 @contextlib.contextmanager

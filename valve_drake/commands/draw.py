@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from valve_drake.commands.common import OK, Subcommands
+from valve_drake.console import say
 
 
 def add(commands: Subcommands) -> None:
@@ -14,11 +15,13 @@ def add(commands: Subcommands) -> None:
 
 
 def command(options: argparse.Namespace) -> int:
-    from valve_drake import drawing, resources
+    from valve_drake import drawing, outputs, resources
     from valve_drake import scenario as scenarios
 
     scenario = scenarios.load(options.scenario, ["hardware.lcm_url=memq://"])  # to be looked at, not to speak
     name = Path(options.scenario or scenarios.DEFAULT).name.removesuffix(".scenario.yaml")
-    for path in drawing.write(scenario, name, options.out or resources.diagrams()):
-        print(path)
+    out = resources.diagrams() if options.out is None else options.out
+    folder = outputs.check_folder(out, "--out", drawing.files(name), made_before=drawing.made_before)
+    for path in drawing.write(scenario, name, folder):
+        say(path)
     return OK

@@ -1,11 +1,15 @@
 """`valve-drake experiment`: the paper's tables, the bound and robustness, on drawn images."""
 
 import argparse
+import importlib.util
 import json
+import os
 from pathlib import Path
 
-from valve_drake.checks import ConfigError
+from valve_drake import outputs
+from valve_drake.checks import ConfigError, require
 from valve_drake.commands.common import OK, Subcommands
+from valve_drake.console import console as make_console
 
 
 def add(commands: Subcommands) -> None:
@@ -21,13 +25,19 @@ def add(commands: Subcommands) -> None:
 def command(options: argparse.Namespace) -> int:
     from valve_drake.analysis import experiments
 
-    if options.out and not options.out.is_dir():
-        raise ConfigError(f"--out must be a folder, got {options.out}")
+    numbers, plot = f"{options.name}.json", "estimator_bound.svg"
+    if options.out is not None:
+        names = (numbers, plot) if options.name == "bound" else (numbers,)
+        require(os.path.isdir(options.out), "--out", "a folder that exists", options.out)
+        outputs.check_folder(options.out, "--out", names, made_before=_made_before)
+        if plot in names and importlib.util.find_spec("matplotlib") is None:
+            raise ConfigError("--out of `bound` needs matplotlib for its plot: pip install 'valve-drake[bench]'")
     result = experiments.run(options.name, options.seed, options.trials)
-    if options.out:
-        (options.out / f"{options.name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    if options.out is not None:
+        outputs.write(options.out / numbers, json.dumps(result, indent=1) + "\n")
         if options.name == "bound":
-            experiments.plot_bound(result, options.out / "estimator_bound.svg")
+            with outputs.replacing(options.out / plot) as file:
+                experiments.plot_bound(result, file)
     if options.json:
         print(json.dumps(result))
     else:
@@ -35,20 +45,28 @@ def command(options: argparse.Namespace) -> int:
     return OK
 
 
+def _made_before(path: Path) -> bool:
+    """Whether a file is an experiment's table of that name, or the plot of the bound."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        return "Cramer-Rao bound" in text if path.suffix == ".svg" else json.loads(text)["experiment"] == path.stem
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
+
+
 def _print_experiment(result: dict) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     def shown(value: object) -> str:
         return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     console.width = max(console.width, 140)  # of the table, also in a pipe
     columns = list(dict.fromkeys(key for row in result["rows"] for key in row))
     table = Table(*columns, box=None, header_style="dim")
     for row in result["rows"]:
         table.add_row(*(shown(row.get(key)) for key in columns))
-    console.print(f"{result['experiment']}: {result['settings']}", markup=False)
+    console.print(f"{result['experiment']}: {result['settings']}")
     console.print(table)
     for name, value in result.get("totals", {}).items():
-        console.print(f"{name}: {value}", markup=False)
+        console.print(f"{name}: {value}")

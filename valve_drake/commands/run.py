@@ -3,20 +3,23 @@
 import argparse
 import contextlib
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from valve_drake import outputs
+from valve_drake.checks import OperationFailed, require_in
 from valve_drake.commands.common import (
     FAILED,
     OK,
     Subcommands,
+    check_log,
     check_rendering,
     display,
     print_summary,
     scenario_overrides,
     stopper,
 )
+from valve_drake.console import complain, console, say
 
 
 def add(commands: Subcommands) -> None:
@@ -25,11 +28,14 @@ def add(commands: Subcommands) -> None:
     p.add_argument("--seed", type=int, help="draws the scenario's distributions, noise and errors")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrides any key of the scenario")
     p.add_argument("--command", choices=("open", "close"), dest="request", help="what to do with the valve")
-    p.add_argument("--log", type=Path, help="the MCAP log (default: logs/run-<seed>.mcap)")
-    p.add_argument("--meshcat", action="store_true", help="live 3D view on localhost")
+    p.add_argument("--log", type=Path, metavar="FILE.mcap", help="the log (default: logs/run-<seed>.mcap, or the next)")
+    p.add_argument("--overwrite", action="store_true", help="--log may exist, and what lies beside it: it is replaced")
+    p.add_argument("--meshcat", action="store_true", help="live 3D view, on this machine only")
     p.add_argument("--lockstep", action="store_true", help="station `hardware`: in lock-step with a twin that is, too")
     p.add_argument("--live", action="store_true", help="serve the log's topics to Foxglove, on this machine only")
-    p.add_argument("--live-port", type=int, default=8765, metavar="PORT", help="of --live (default: 8765)")
+    p.add_argument(
+        "--live-port", type=int, default=8765, metavar="PORT", help="port for --live (default: 8765; 0: any)"
+    )
     p.add_argument("--no-html", action="store_true", help="no 3D recording beside the log")
     p.add_argument("--no-truth", action="store_true", help="leave the simulation's truth out of the log")
     p.add_argument("--duration", type=float, metavar="SECONDS", help="end after this simulated time")
@@ -46,36 +52,49 @@ def command(options: argparse.Namespace) -> int:
     overrides = scenario_overrides(options)
     if options.request:
         overrides.append(f"command={options.request}")
+    require_in(options.live_port, 0, 65535, "--live-port")
     scenario = scenarios.load(options.scenario, overrides)
-    log = options.log or Path("logs") / f"run-{scenario.seed}.mcap"
-    html = None if options.no_html or scenario.station == "hardware" else log.with_suffix(".html")
+    recording = not options.no_html and scenario.station != "hardware"
+    if options.log is None:
+        log = Path("logs") / f"run-{scenario.seed}.mcap"
+    else:
+        inputs = [Path(name) for name in (options.scenario, scenario.head_calibration, scenario.taught) if name]
+        companions = (".json", ".html") if recording else (".json",)
+        log = check_log(options.log, "--log", options.overwrite, inputs, companions)
     with stopper() as stop, _live(options) as live, display(not options.json) as show:
         result = run(
             scenario,
             log,
-            html=html,
-            meshcat_port=7000 if options.meshcat else None,
+            overwrite=options.overwrite and options.log is not None,
+            recording=recording,
+            meshcat=options.meshcat,
             truth=not options.no_truth,
             duration=options.duration,
             live=live,
             show=show,
+            say=complain,
             stop=stop,
         )
-    log.with_suffix(".json").write_text(json.dumps(result.as_json(), indent=1) + "\n", encoding="utf-8")
+    numbers = result.as_json()
+    troubles = [*result.troubles]
+    try:
+        outputs.write(result.name.with_suffix(".json"), json.dumps(numbers, indent=1) + "\n")
+    except OperationFailed as error:
+        if not result.log_error:  # else the disk has been complained of
+            troubles.append(str(error))
     if options.json:
-        print(json.dumps(result.as_json()))
+        print(json.dumps(numbers))
     else:
         _print_result(result)
     if options.profile and not options.json:
         for kind, share in sorted(result.shares.items(), key=lambda item: -item[1]):
             print(f"{kind:>10}  {100 * share:5.1f} %  {share * result.wall_time:6.2f} s")
         print(f"{result.beside:.2f} s of rendering on other processors; above, what the run waited for")
-    if result.log_error:
-        print(f"valve-drake: {result.log_error}", file=sys.stderr)
-        return FAILED
-    if options.duration is not None:
-        return OK
-    return OK if result.summary.outcome == "done" else FAILED
+    for line in troubles:
+        complain(line)
+    cut_short = options.duration is not None and not result.summary.outcome
+    good = (cut_short or result.summary.outcome == "done") and not (troubles or result.log_error)
+    return OK if good else FAILED
 
 
 @contextlib.contextmanager
@@ -87,16 +106,16 @@ def _live(options: argparse.Namespace) -> Iterator[object | None]:
     from valve_drake.recording.live import LiveView
 
     with LiveView(options.live_port) as view:
-        print(f"live at ws://127.0.0.1:{view.port} (Foxglove: open connection)", file=sys.stderr)
+        complain(f"live at ws://127.0.0.1:{view.port} (Foxglove: open connection)")
         yield view
 
 
 def _print_result(result: object) -> None:
-    from rich.console import Console
-
-    console = Console(highlight=False)
     s = result.summary
-    print_summary(console, s)
+    print_summary(console(), s)
     factor = s.sim_time_s / max(result.wall_time, 1e-9)
-    console.print(f"{s.sim_time_s:.1f} s simulated in {result.wall_time:.1f} s (x{factor:.2f} real time)")
-    console.print(f"log {result.log}" + (f"  3D recording {result.html}" if result.html else ""))
+    say(f"{s.sim_time_s:.1f} s simulated in {result.wall_time:.1f} s (x{factor:.2f} real time)")
+    if result.log_error:
+        say("these numbers are of what was logged; the verdict is the run's")
+    if result.log is not None:
+        say(f"log {result.log}" + (f"  3D recording {result.html}" if result.html else ""))

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from valve_drake.commands.common import OK, Subcommands, check_rendering
+from valve_drake.console import say
 
 
 def add(commands: Subcommands) -> None:
@@ -15,10 +16,12 @@ def add(commands: Subcommands) -> None:
 
 def command(options: argparse.Namespace) -> int:
     check_rendering()
-    from valve_drake import resources, teaching
+    from valve_drake import outputs, resources, teaching
     from valve_drake import scenario as scenarios
 
-    folder = options.out or resources.models() / "taught"
-    teaching.write(scenarios.load(options.scenario), folder)
-    print(folder / "hands.yaml")
+    scenario = scenarios.load(options.scenario)
+    out = resources.models() / "taught" if options.out is None else options.out
+    folder = outputs.check_folder(out, "--out", teaching.FILES, made_before=teaching.made_before)
+    teaching.write(scenario, folder)
+    say(folder / teaching.REFERENCES)
     return OK

@@ -50,7 +50,8 @@ class LiveView:
                 context=self._context,
             )
         except (RuntimeError, OSError) as error:
-            raise ConfigError(f"--live cannot serve on {host}:{port}: {error}") from None
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ConfigError(f"--live cannot serve on {host}:{port}: {reason}") from None
 
     @property
     def port(self) -> int:

@@ -97,9 +97,10 @@ class LogWriter:
         channel.count += 1
 
     def write_metadata(self, name: str, facts: Mapping[str, str]) -> None:
-        """Adds a metadata record and flushes."""
+        """Adds a metadata record and flushes. What is not UTF-8, of a file's name, is written as \\udcXX."""
         self._close_chunk()
-        self._hand_over(0, self._mcap.add_metadata, name, dict(facts))
+        facts = {key: value.encode("utf-8", "backslashreplace").decode() for key, value in facts.items()}
+        self._hand_over(0, self._mcap.add_metadata, name, facts)
         self.flush()
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:

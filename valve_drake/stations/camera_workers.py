@@ -64,7 +64,11 @@ class CameraWorkers:
             here, there = socket.socketpair()
             with there:
                 code = f"from valve_drake.stations.camera_workers import serve; serve({there.fileno()})"
-                process = subprocess.Popen([sys.executable, "-c", code], pass_fds=[there.fileno()])
+                process = subprocess.Popen(
+                    [sys.executable, "-c", code],
+                    pass_fds=[there.fileno()],
+                    start_new_session=True,  # a terminal's signals are for the run, which decides when this ends
+                )
             worker = _Worker(process, multiprocessing.connection.Connection(here.detach()))
             _send(worker.wire, rig)
             self._workers.append(worker)
