@@ -8,10 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from log_samples import write_log
 
 from valve_drake import cli, outputs, teaching
 from valve_drake.commands import common, experiment
 from valve_drake.commands.common import Interrupted, break_off, signals, stopper
+from valve_drake.recording.reader import LogReader
 
 PROGRAM = [sys.executable, "-m", "valve_drake"]
 
@@ -154,3 +156,19 @@ def test_references_may_be_taught_again_where_they_were_taught_before(tmp_path):
     assert not teaching.made_before(tmp_path / "left.png")
     (tmp_path / "hands.yaml").write_text(f"# {teaching.HEADING} For each hand\n")
     assert teaching.made_before(tmp_path / "left.png")
+
+
+def test_recover_writes_over_nothing_unasked_and_never_over_what_it_reads(tmp_path, capsys):
+    write_log(tmp_path / "a.mcap", 1.0)
+    left = (tmp_path / "a.mcap").rename(tmp_path / "b.mcap.active")
+    before = left.read_bytes()
+    (tmp_path / "b.mcap").write_text("mine")
+    os.link(left, tmp_path / "hard")
+    recover = ["recover", str(left), "-o"]
+    for out, words in (("b.mcap", "--overwrite"), ("b.mcap.active", "another file"), ("hard", "another file")):
+        assert cli.main([*recover, str(tmp_path / out)]) == 2
+        assert words in capsys.readouterr().err
+    assert (tmp_path / "b.mcap").read_text() == "mine" and left.read_bytes() == before
+    assert cli.main([*recover, str(tmp_path / "b.mcap"), "--overwrite"]) == 0
+    assert LogReader(tmp_path / "b.mcap").damage == [] and left.read_bytes() == before
+    assert cli.main([*recover, str(tmp_path / "b.mcap")]) == 0  # made by recover itself

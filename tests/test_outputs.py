@@ -36,6 +36,11 @@ def test_an_existing_file_is_refused_unless_asked_for_or_of_the_same_kind(tmp_pa
     assert old.read_text() == "mine"
 
 
+def test_an_empty_file_holds_nothing_and_may_be_filled(tmp_path):
+    (tmp_path / "empty").touch()
+    assert outputs.check(tmp_path / "empty", "--out") == tmp_path / "empty"
+
+
 @pytest.mark.parametrize("name", ["", ".", "..", "/", "folder", "folder/."])
 def test_a_folder_is_no_file(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
@@ -111,7 +116,7 @@ def test_a_name_that_is_not_utf8_is_shown_in_ascii(tmp_path):
     outputs.write(path, f"{path}")
     assert open(path, encoding="utf-8").read().endswith("a\\udcff")
     with pytest.raises(ConfigError) as caught:
-        outputs.check(path, "--out")
+        outputs.check(path, "--out")  # exists
     str(caught.value).encode("ascii")
 
 

@@ -185,6 +185,16 @@ def test_a_log_that_was_named_and_exists_is_replaced_with_overwrite_only(here, c
     assert code == 0 and err == "" and LogReader("a.mcap").damage == []
 
 
+def test_a_log_takes_the_place_of_an_empty_file_and_follows_a_link(here, capsys):
+    (here / "there").mkdir()
+    (here / "there" / "empty.mcap").touch()
+    (here / "link.mcap").symlink_to("there/empty.mcap")
+    code, _, err = command(capsys, "--duration", "0.01", "--log", "link.mcap")
+    assert code == 0 and err == "" and (here / "link.mcap").is_symlink()
+    assert LogReader(here / "there" / "empty.mcap").damage == []
+    assert sorted(path.name for path in (here / "there").iterdir()) == ["empty.json", "empty.mcap"]
+
+
 @pytest.mark.parametrize("name", ["x.json", "y.html", "log", ".mcap", ".", "", "/", "x.mcap.active"])
 def test_a_log_is_named_mcap_so_that_what_lies_beside_it_has_another_name(here, capsys, name):
     code, _, err = command(capsys, "--duration", "0.01", "--log", name)

@@ -31,7 +31,7 @@ def check(
     option: what named the path, for the error line. inputs: files that it must not be, by identity and not by name:
     what the command reads (and the unfinished FILE.active of it), and what else it writes.
     made_before: says whether an existing file is a product of the same kind, which may be replaced.
-    overwrite: whether any existing file may be replaced; None where a command has no --overwrite.
+    overwrite: whether any existing file may be replaced; None where a command has no --overwrite. An empty one may.
     new_folders: the folder may not exist yet; the caller makes it.
     Raises ConfigError, one line, for a path that must not or cannot be written.
     """
@@ -40,7 +40,8 @@ def check(
         for name in (Path(other), Path(f"{os.fspath(other)}.active")):
             if _same(target, name):
                 raise _refusal(option, f"another file than {shown(name)}", path)
-    if existing is not None and not overwrite and not (made_before is not None and made_before(target)):
+    free = existing is None or existing.st_size == 0  # an empty file, as of mktemp, holds nothing
+    if not free and not overwrite and not (made_before is not None and made_before(target)):
         hint = "" if overwrite is None else " (--overwrite replaces it)"
         raise _refusal(option, "a file that does not exist yet" + hint, path)
     folder = target.parent

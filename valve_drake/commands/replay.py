@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 from pathlib import Path
 
 from valve_drake.checks import ConfigError
@@ -25,12 +26,13 @@ def command(options: argparse.Namespace) -> int:
     from valve_drake.runner import replay
 
     log = LogReader(options.log)
-    copy = None
+    copy, overwrite = None, False
     if options.copy is not None:
         copy = check_log(options.copy, "--log", options.overwrite, [options.log])
+        overwrite = options.overwrite or os.path.lexists(copy)  # it was checked
     try:
         with display(not options.json) as show:
-            result = replay(log, options.set, copy=copy, overwrite=options.overwrite, show=show, say=complain)
+            result = replay(log, options.set, copy=copy, overwrite=overwrite, show=show, say=complain)
     except ConfigError as error:
         if not log.damage:
             raise

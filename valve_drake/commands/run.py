@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -65,7 +66,7 @@ def command(options: argparse.Namespace) -> int:
         result = run(
             scenario,
             log,
-            overwrite=options.overwrite and options.log is not None,
+            overwrite=options.log is not None and (options.overwrite or os.path.lexists(log)),  # it was checked
             recording=recording,
             meshcat=options.meshcat,
             truth=not options.no_truth,

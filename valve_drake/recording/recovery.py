@@ -13,15 +13,15 @@ from valve_drake.recording.container import CHUNK_SIZE, LIBRARY, RECOVERED, Chun
 from valve_drake.recording.reader import LogReader
 
 
-def recover(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> LogReader:
+def recover(source: str | os.PathLike[str], path: str | os.PathLike[str], overwrite: bool | None = None) -> LogReader:
     """Writes all that can be read of the log `source` to a new, sound log `path`; returns the reader of `source`.
 
     Everything keeps its bytes, times, numbers and order: messages, channels, schemas, attachments and metadata, of one
     name as well. Metadata `recovered` is added: the number of messages and all damage, earlier recoveries' included.
-    Raises ConfigError if `source` is no log or `path` is a file that is no recovered log, OperationFailed if the new
-    one cannot be written.
+    Raises ConfigError if `source` is no log, or `path` a file that is no recovered log, unless `overwrite`;
+    OperationFailed if the new one cannot be written.
     """
-    target = outputs.check(path, "-o", inputs=[source], made_before=was_recovered)
+    target = outputs.check(path, "-o", inputs=[source], made_before=was_recovered, overwrite=overwrite)
     log = LogReader(source)
     with outputs.replacing(target) as file:
         copy(log, file)
