@@ -244,7 +244,8 @@ def load_head(path: str | pathlib.Path) -> StereoHead:
     """Reads a head calibration (see `save_head`). Raises ConfigError naming the file and the key."""
     key = f"calibration {path}"
     data = yaml_file.read(path, source=key)
-    require(isinstance(data, dict), key, "a mapping with left, right and X_LR", data)
+    if not isinstance(data, dict):  # whatever the file is, it is not shown
+        raise ConfigError(f"{key} must be a mapping with left, right and X_LR")
     return head_from(data, key)
 
 
