@@ -1,6 +1,7 @@
 """The wiring, the names, and the direction of imports."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,16 @@ def test_the_reviewed_wiring_list_is_current(system):
 
 def test_the_drawing_is_current(system):
     assert drawing.svg(system.diagram) == (resources.diagrams() / "simulated.svg").read_text()
+
+
+def test_a_block_without_a_place_of_its_own_is_drawn_too(system, monkeypatch):
+    places = {name: place for name, place in drawing.PLACES.items() if name != "image_servo"}
+    monkeypatch.setattr(drawing, "PLACES", places)
+    drawn = drawing.svg(system.diagram)
+    assert drawn.count(">image_servo<") == 1
+    assert len(re.findall("marker-end", drawn)) == len(
+        re.findall("marker-end", (resources.diagrams() / "simulated.svg").read_text())
+    )
 
 
 def test_every_input_of_every_block_is_connected(system):

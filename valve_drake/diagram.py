@@ -1,15 +1,16 @@
-"""THE wiring: every block of the system and every arrow between them.
+"""The wiring: every block of the system and every arrow between them.
 
-`WIRES` is the figure as a list, one line an arrow; `make_diagram` adds the blocks and connects them. The reviewed list
-and drawing of each scenario lie in diagrams/ (made by `valve-drake draw`; a test keeps them current).
+`WIRES` is the list of arrows; `make_diagram` adds the blocks and connects them. The reviewed list and drawing of each
+scenario are in diagrams/ (made by `valve-drake draw`; a test keeps them current).
 """
 
 import dataclasses as dc
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort
 from pydrake.systems.primitives import Multiplexer
 
 from valve_drake import resources
@@ -33,6 +34,7 @@ from valve_drake.perception.handle_marker_system import HandleMarkerSystem
 from valve_drake.perception.line_fitting_system import LineFittingSystem
 from valve_drake.perception.rectangle_estimator_system import RectangleEstimatorSystem
 from valve_drake.perception.stereo_positioning_system import StereoPositioningSystem
+from valve_drake.ports import Block
 from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.recording.signals import JOINED
 from valve_drake.robot_state_system import RobotStateSystem
@@ -48,13 +50,13 @@ from valve_drake.supervisor.supervisor import BEHAVIORS
 from valve_drake.supervisor.supervisor_system import SupervisorSystem
 
 WIRES: tuple[tuple[str, str], ...] = (
-    # the head's eyes: stages 1 and 2
+    # head cameras: stages 1 and 2
     ("station.head_left.image", "color_segmentation.head_left_image"),
     ("station.head_right.image", "color_segmentation.head_right_image"),
     ("color_segmentation.segmentation", "line_fitting.segmentation"),
     ("color_segmentation.segmentation", "stereo_positioning.segmentation"),
     ("line_fitting.edges", "rectangle_estimator.edges"),
-    # the wrists' eyes
+    # wrist cameras
     ("station.left_wrist.image", "handle_marker.left_wrist_image"),
     ("station.right_wrist.image", "handle_marker.right_wrist_image"),
     # joints and forces
@@ -63,7 +65,7 @@ WIRES: tuple[tuple[str, str], ...] = (
         ("robot_state.robot_state", f"{block}.robot_state")
         for block in ("stereo_positioning", "rectangle_estimator", *BEHAVIORS, "command_selector")
     ),
-    # what is seen, to who acts on it
+    # from perception to the behaviours
     ("stereo_positioning.position", "valve_search.position"),
     ("stereo_positioning.position", "base_approach.position"),
     ("rectangle_estimator.estimate", "valve_search.estimate"),
@@ -75,7 +77,7 @@ WIRES: tuple[tuple[str, str], ...] = (
     ("kinematic_approach.stance", "base_approach.stance"),
     ("kinematic_approach.plan", "hybrid_rotation.plan"),
     ("hybrid_rotation.turn", "kinematic_approach.turn"),
-    # all commands through one block to the robot
+    # all commands reach the robot through command_selector
     *((f"{block}.command", f"command_selector.{block}") for block in BEHAVIORS),
     ("station.health", "command_selector.health"),
     *((f"command_selector.{spec.name}", f"station.{spec.name}") for spec in CONTRACT if spec.direction == "in"),
@@ -94,7 +96,7 @@ OPERATOR = "operator"  # the diagram's input port
 
 @dc.dataclass(frozen=True)
 class System:
-    """The whole system and the blocks that a runner wants to talk to."""
+    """The whole system, and the parts of it that a runner uses."""
 
     diagram: Diagram
     station: Diagram
@@ -107,9 +109,9 @@ def home(scenario: Scenario) -> np.ndarray:
 
 
 def initial_commands(scenario: Scenario) -> dict[str, np.ndarray]:
-    """What the station's inputs hold before the first command."""
+    """The values of the station's inputs before the first command, by port."""
     arms = home(scenario)
-    out = {spec.name: np.zeros(spec.kind) for spec in CONTRACT if spec.direction == "in"}
+    out = {spec.name: np.zeros(spec.kind) for spec in CONTRACT if isinstance(spec.kind, int) and spec.direction == "in"}
     for k, side in enumerate(SIDES):
         out[f"{side}_arm.position_command"] = arms[6 * k : 6 * k + 6]
         out[f"{side}_gripper.position_command"] = np.array([scenario.kinematic_approach.opening])
@@ -124,7 +126,7 @@ def make_station(
     workers: CameraWorkers | None = None,
     link: RobotLink | None = None,
 ) -> Diagram:
-    """The station that a resolved scenario names; `replay` shows a recording, `hardware` speaks through `link`."""
+    """The station of a resolved scenario. recording: for station `replay`; link: for station `hardware`."""
     if scenario.station == "hardware":
         return make_hardware_station(RobotLink(Bus(scenario.hardware)) if link is None else link)
     if scenario.station == "replay":
@@ -133,7 +135,7 @@ def make_station(
         return make_replay_station(recording)
     return make_simulated_station(
         scenario.simulation,
-        tuple(scenario.marker.size),
+        (scenario.marker.size[0], scenario.marker.size[1]),
         load_head(resources.find(scenario.head_calibration, resources.models())),
         home(scenario),
         scenario.kinematic_approach.opening,
@@ -143,14 +145,14 @@ def make_station(
     )
 
 
-def make_blocks(scenario: Scenario) -> list:
+def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     """All blocks between the station's outputs and its inputs: the same objects for every station."""
     head = load_head(resources.find(scenario.head_calibration, resources.models()))
     taught = load_taught(resources.find(scenario.taught, resources.models()))
     marker = scenario.marker
     view = {side: taught[side].view for side in SIDES}
     area = {side: taught[side].area for side in SIDES}
-    X_LEyes = make(np.eye(3), head.X_LR[:, 3] / 2)  # the gaze is that of both eyes, or near things leave one of them
+    X_LEyes = make(np.eye(3), head.X_LR[:, 3] / 2)  # between both head cameras: a near marker stays in both images
     collision = CollisionModel(marker, opening=scenario.kinematic_approach.opening)
     return [
         RobotStateSystem(),
@@ -185,8 +187,7 @@ def make_diagram(
 ) -> System:
     """The whole system for a resolved scenario; `recording` is what station `replay` shows, `link` leads to a robot.
 
-    workers: make the simulated cameras' images beside the run. truth=False leaves the recorder without the `truth.*`
-    ports.
+    workers: render the simulated cameras' images in other processes. truth=False: the recorder gets no `truth.*` ports.
     """
     builder = DiagramBuilder()
     station = builder.AddSystem(make_station(scenario, meshcat, recording, workers, link))
@@ -194,7 +195,7 @@ def make_diagram(
     blocks = {block.get_name(): block for block in make_blocks(scenario)}
     for block in blocks.values():
         builder.AddSystem(block)
-    systems = blocks | {"station": station}
+    systems: dict[str, Any] = blocks | {"station": station}
     for source, target in WIRES:
         (a, output), (b, port) = source.split(".", 1), target.split(".", 1)
         builder.Connect(systems[a].GetOutputPort(output), systems[b].GetInputPort(port))
@@ -207,7 +208,7 @@ def make_diagram(
     return System(diagram, station, systems["supervisor"])
 
 
-def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems: dict, truth: bool) -> None:
+def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems: dict[str, Any], truth: bool) -> None:
     """Every port of the recorder is named after what it records: a station's port, a command, block.port, or JOINED."""
     station = systems["station"]
     exported = {station.get_output_port(k).get_name() for k in range(station.num_output_ports())}
@@ -236,8 +237,8 @@ def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems
         connect(port.get_name(), port)
 
 
-def command(system: System, context: object, request: OperatorCommand) -> None:
-    """Gives the system an operator's request."""
+def command(system: System, context: Context, request: OperatorCommand) -> None:
+    """Gives the system an operator's request, from now on."""
     system.diagram.GetInputPort(OPERATOR).FixValue(context, Value(request))
 
 

@@ -10,7 +10,7 @@ from valve_drake import outputs
 from valve_drake.diagram import make_diagram, wiring
 from valve_drake.scenario import Scenario, resolve
 
-# Where each block stands: column, row; and its colour by kind.
+# Column and row of each block; and its colour by kind.
 PLACES: dict[str, tuple[float, float]] = {
     "station": (0, 2.7),
     "robot_state": (1, 4.9),
@@ -38,6 +38,7 @@ KINDS = {
     "command_selector": "#37474f",
     "supervisor": "#6a4c93",
 }
+BOTTOM = 6.0  # row of blocks without a place
 BEHAVIOR = "#1f5f8b"
 WIDTH, HEIGHT, COLUMN, ROW, LEFT, TOP = 158, 46, 222, 92, 24, 40
 TO_ALL = {"status": "#6a4c93", "command": "#37474f"}  # ports that every behaviour has: coloured, not labelled
@@ -77,7 +78,7 @@ def wiring_text(diagram: Diagram) -> str:
 
 
 def svg(diagram: Diagram) -> str:
-    """The drawing. A block that is new has no place yet and raises KeyError: give it one in PLACES."""
+    """The drawing. A block without a place in PLACES is drawn in the bottom row."""
     edges: dict[tuple[str, str], list[str]] = {}
     buses: dict[str, list[str]] = {bus: [] for bus in BUSES}
     for line in wiring(diagram):
@@ -88,8 +89,10 @@ def svg(diagram: Diagram) -> str:
         else:
             edges.setdefault((a, b), []).append(port)
     names = {system.get_name() for system in diagram.GetSystems()}
+    new = sorted(names - set(PLACES))
+    places = PLACES | {name: (float(k), BOTTOM) for k, name in enumerate(new)}
     width = int(LEFT * 2 + 5.4 * COLUMN + WIDTH + 36)
-    height = int(TOP + 6.3 * ROW)
+    height = int(TOP + (BOTTOM + 1 if new else 6.3) * ROW)
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
         'font-family="Helvetica, Arial, sans-serif">',
@@ -100,24 +103,24 @@ def svg(diagram: Diagram) -> str:
         "reads the mode (purple), the robot's state (grey), its health (amber). "
         "Arrows: status (purple), command (dark).</text>",
     ]
-    x, y = _corner("supervisor")
+    x, y = _corner(places["supervisor"])
     parts.append(
         f'<path d="M{x + WIDTH / 2:.0f} {y - 34:.0f}L{x + WIDTH / 2:.0f} {y:.0f}" stroke="#90a4ae" stroke-width="1.6" '
         f'marker-end="url(#a)"/><text x="{x + WIDTH / 2:.0f}" y="{y - 40:.0f}" font-size="12" fill="#455a64" '
         'text-anchor="middle">operator</text>'
     )
-    parts += [_edge(a, b, ports) for (a, b), ports in sorted(edges.items())]
-    parts += [_block(name, [bus for bus in BUSES if name in buses[bus]]) for name in sorted(names)]
+    parts += [_edge(places[a], places[b], ports) for (a, b), ports in sorted(edges.items())]
+    parts += [_block(name, places[name], [bus for bus in BUSES if name in buses[bus]]) for name in sorted(names)]
     return "\n".join([*parts, "</svg>"]) + "\n"
 
 
-def _corner(name: str) -> tuple[float, float]:
-    column, row = PLACES[name]
+def _corner(place: tuple[float, float]) -> tuple[float, float]:
+    column, row = place
     return LEFT + column * COLUMN, TOP + row * ROW
 
 
-def _block(name: str, reads: Iterable[str]) -> str:
-    x, y = _corner(name)
+def _block(name: str, place: tuple[float, float], reads: Iterable[str]) -> str:
+    x, y = _corner(place)
     color = KINDS.get(name, BEHAVIOR)
     out = [
         f'<rect x="{x:.0f}" y="{y:.0f}" width="{WIDTH}" height="{HEIGHT}" rx="8" fill="{color}"/>',
@@ -132,7 +135,7 @@ def _block(name: str, reads: Iterable[str]) -> str:
     return "".join(out)
 
 
-def _edge(a: str, b: str, ports: list[str]) -> str:
+def _edge(a: tuple[float, float], b: tuple[float, float], ports: list[str]) -> str:
     (xa, ya), (xb, yb) = _corner(a), _corner(b)
     short = ports[0] if len(ports) == 1 else f"{len(ports)} ports"
     color = TO_ALL.get(ports[0], "#90a4ae") if len(ports) == 1 else "#90a4ae"

@@ -32,7 +32,7 @@ class Pace(Message):
     p99: float = 0.0
     longest: float = 0.0
 
-    def as_json(self) -> dict:
+    def as_json(self) -> dict[str, float]:
         """What `run --json` says of it."""
         times = {f"{name}_ms": 1e3 * getattr(self, name) for name in ("median", "p99", "longest")}
         return {"ticks": self.ticks, "missed": self.missed, "lost_s": self.lost, **times}

@@ -35,7 +35,7 @@ import time as _time
 import types
 import typing
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Generic, TypeVar, Union
+from typing import Any, ClassVar, Generic, TypeAlias, TypeVar, Union
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -46,7 +46,8 @@ from valve_drake.messages import Message
 TICK = 1 / 128  # control period [s]
 SLOT = 1 / 512  # plant period, and the slots of a tick [s]
 
-Kind = type | int | AbstractValue  # a message class, the size of a vector, or a model value of one of Drake's types
+# Of a port: a message class, the size of a vector, or a model value of one of Drake's types.
+Kind: TypeAlias = type | int | AbstractValue
 Outputs = dict[str, Any]  # port name -> what it holds from now on; ports left out keep their value
 
 

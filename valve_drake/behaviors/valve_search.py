@@ -1,4 +1,4 @@
-"""Where the robot looks: the search for the valve, and the gaze that keeps it in view afterwards.
+"""The gaze: the search for the valve, and keeping it in view afterwards.
 
 Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base while searching.
 
@@ -37,7 +37,7 @@ from valve_drake.motion import follow, slew, towards
 HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading) in O, torso (3,) -> X_OL (3, 4)
 
 DRIVING = (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH)
-WATCHING = (*DRIVING, Mode.MEASURE)  # a marker that is lost matters
+WATCHING = (*DRIVING, Mode.MEASURE)  # modes that fail when the marker is lost
 
 
 @dc.dataclass
@@ -88,9 +88,10 @@ class Memory:
     verdict: str = Verdict.NONE.value
     detail: str = ""
     # torso
-    torso: np.ndarray | None = None  # command [rad]
-    velocity: np.ndarray | None = None  # of the command [rad/s]
-    goal: np.ndarray | None = None  # of the previous step [rad]
+    started: bool = False  # the torso has been measured: its command starts there
+    torso: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # command [rad]
+    velocity: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # of the command [rad/s]
+    goal: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # of the previous step [rad]
     # the marker
     target: np.ndarray | None = None  # p_OV [m]
     target_time: float = -np.inf  # its capture time [s]
@@ -125,7 +126,7 @@ def aim(head_pose: HeadPose, base: np.ndarray, torso: np.ndarray, p_OV: np.ndarr
 
 
 def agree(config: ValveSearchConfig, looks: tuple[tuple[np.ndarray, float], ...], eye: np.ndarray) -> bool:
-    """Do the last sightings show one and the same place?"""
+    """Whether the last sightings show one place."""
     if len(looks) < config.sightings:
         return False
     points = np.array([p for p, _ in looks])
@@ -148,10 +149,10 @@ def step(
     """One tick of length dt -> memory, command, status."""
     m = memory
     base = robot_state.odometry[:3]
-    if m.torso is None:
+    if not m.started:
         if len(robot_state.history) == 0:  # nothing was measured yet
             return m, Command(time=time), Status(time=time, activation=mode.activation)
-        m = dc.replace(m, torso=robot_state.torso, goal=robot_state.torso, velocity=np.zeros(3))
+        m = dc.replace(m, started=True, torso=robot_state.torso, goal=robot_state.torso, velocity=np.zeros(3))
     if mode.activation != m.activation:
         m = _begin(m, time, mode, base)
 
@@ -178,6 +179,7 @@ def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
     return Memory(
         activation=mode.activation,
         since=time,
+        started=m.started,
         torso=m.torso,
         velocity=m.velocity,
         goal=m.goal,
@@ -209,7 +211,7 @@ def _status(config: ValveSearchConfig, m: Memory, time: float, mode: ModeState) 
 
 
 def _sight(config: ValveSearchConfig, m: Memory, position: StereoPosition, estimate: RectangleEstimate) -> Memory:
-    """Takes the newest of both stages' sightings as the marker's place."""
+    """Takes the newer of the sightings of stages 1 and 2 as the marker's place."""
     if estimate.found and not (position.found and position.time > estimate.time):
         time, X_OL, p_LV = estimate.time, estimate.X_OL, estimate.X_LV[:, 3]
     elif position.found:
@@ -220,7 +222,7 @@ def _sight(config: ValveSearchConfig, m: Memory, position: StereoPosition, estim
         return m
     m = dc.replace(m, capture_time=time)
     p_OV = apply(X_OL, p_LV)
-    if not np.all(np.isfinite(p_OV)):  # it would stay in the memory for ever
+    if not np.all(np.isfinite(p_OV)):  # it would stay in the memory
         return m
     far = m.target is not None and np.linalg.norm(p_OV - m.target) > config.jump
     if far and time - m.target_time < config.jump_after:
@@ -235,14 +237,14 @@ def _gaze(
     if m.target is None:
         return np.array([0.0, m.goal[1], m.goal[2]])
     pitch, yaw = aim(head_pose, base, np.array([waist, m.goal[1], m.goal[2]]), m.target)
-    # What the neck cannot turn, the waist takes over, but only while the arms are folded.
+    # The waist turns by what the neck cannot, but only while the arms are folded.
     beyond = waist + yaw - np.clip(waist + yaw, -config.sweep_yaw, config.sweep_yaw)
     twist = float(np.clip(beyond, -config.sweep_waist, config.sweep_waist)) if driving else 0.0
     return np.array([twist, *_neck(config, pitch, yaw)])
 
 
 def _neck(config: ValveSearchConfig, pitch: float, yaw: float) -> tuple[float, float]:
-    """What the neck can do of it."""
+    """Neck pitch and yaw, clipped to the joints' limits."""
     return (
         float(np.clip(pitch, config.pitch_low, config.pitch_high)),
         float(np.clip(yaw, -config.yaw_limit, config.yaw_limit)),

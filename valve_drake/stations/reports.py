@@ -66,7 +66,7 @@ class _Record:
     words: str = ""
     since: float = math.inf  # the first bad message after the last good one [s]
     last: float = -math.inf  # the last one that was part of a fault [s]
-    recent: collections.deque = dc.field(default_factory=lambda: collections.deque(maxlen=MANY))
+    recent: collections.deque[float] = dc.field(default_factory=lambda: collections.deque(maxlen=MANY))
     count: int = 0
 
 

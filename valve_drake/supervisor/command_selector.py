@@ -317,13 +317,13 @@ def _joints(
     stay = np.clip(m.position + braked * dt, np.minimum(b.low, m.position), np.maximum(b.high, m.position))
     position = np.where(held, stay, position)
     velocity = np.where(held, (stay - m.position) / dt, velocity)
-    changed = []
+    changed: list[str] = []
     if (asked == target).all() and (position == target).all():  # nearly every tick
         return position, velocity, target, changed
     for group in wanted:
-        part = JOINTS.get(group)
-        if part is None:
+        if group not in JOINTS:
             continue
+        part = JOINTS[group]
         if np.any(asked[part] != target[part]):
             changed.append(f"{group}.position")
         short = position[part] != target[part]

@@ -25,6 +25,7 @@ once: command_selector opens the hands in failed and stopped.
 import dataclasses as dc
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from valve_drake.config import Config, number, table
 from valve_drake.messages import (
@@ -163,7 +164,7 @@ def step(
         return _abort(s, time, Mode.STOPPED, Verdict.STOPPED, "stopped by the operator")
     fault = find_fault(config, time, health, selector)
     if s.mode == Mode.IDLE:
-        return _begin(config, s, time, request, operator.angle, fault) if request else s
+        return _begin(config, s, time, request, operator.angle, fault) if operator is not None and request else s
     if fault and not _aborting(s):
         return _abort(s, time, Mode.FAILED, Verdict.FAULT, fault)
 
@@ -214,7 +215,7 @@ def find_fault(config: SupervisorConfig, time: float, health: Health | None, sel
 # ---------------------------------------------------------------- transitions
 
 
-def _enter(s: State, time: float, mode: Mode, reason: str, **changes: object) -> State:
+def _enter(s: State, time: float, mode: Mode, reason: str, **changes: Any) -> State:
     """A new activation."""
     return dc.replace(
         s, mode=mode, activation=s.activation + 1, since=time, reason=reason, entered=(*s.entered, mode), **changes

@@ -8,7 +8,7 @@ from valve_drake.supervisor.supervisor import BEHAVIORS, State, SupervisorConfig
 class SupervisorInputs(Inputs):
     operator: OperatorCommand = OperatorCommand()
     health: Health | None = None  # a station that reports nothing is a fault
-    selector: SelectorReport = SelectorReport()
+    selector: SelectorReport | None = None
     valve_search: Status = Status()
     base_approach: Status = Status()
     kinematic_approach: Status = Status()
