@@ -321,14 +321,22 @@ def turns(carriers: Poses) -> np.ndarray:
 
 def published(carriers: Poses, boards: Poses, method: int) -> np.ndarray:
     """X (3, 4) by one of OpenCV's METHODS. Raises ConfigError if it finds none."""
-    R, t = cv2.calibrateHandEye(
-        [X[:, :3] for X in carriers],
-        [X[:, 3] for X in carriers],
-        [X[:, :3] for X in boards],
-        [X[:, 3] for X in boards],
-        method=method,
-    )
-    if not (np.isfinite(R).all() and np.isfinite(t).all()):
+    logging = cv2.utils.logging
+    level = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # it writes to the terminal what we say ourselves
+    try:
+        R, t = cv2.calibrateHandEye(
+            [X[:, :3] for X in carriers],
+            [X[:, 3] for X in carriers],
+            [X[:, :3] for X in boards],
+            [X[:, 3] for X in boards],
+            method=method,
+        )
+    except cv2.error as error:
+        raise ConfigError("hand-eye: no solution; do the poses belong to the images?") from error
+    finally:
+        logging.setLogLevel(level)
+    if not (np.isfinite(t).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-3):  # also false for NaN
         raise ConfigError("hand-eye: no solution; do the poses belong to the images?")
     return frames.make(R, t.ravel())
 
@@ -452,7 +460,7 @@ def _compared(seen: Seen, X: np.ndarray) -> dict[str, Method]:
                 one = published(carriers[rest], seen.board[rest], method)
                 Y = _mean_pose(_targets(one, seen.only(rest)))
                 left_out.append([float(v[0]) for v in _apart(Y, _targets(one, seen.only([k])))])
-        except (ConfigError, cv2.error):
+        except ConfigError:
             continue
         turned, displaced = _apart(X, whole[None])
         rms = np.sqrt(np.mean(np.square(left_out), 0)) if left_out else np.full(2, math.nan)

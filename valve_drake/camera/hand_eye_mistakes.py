@@ -29,6 +29,7 @@ MAX_SCATTER_DEG, MAX_SCATTER_MM = 3.0, 50.0  # of the arm: more is no arm, the p
 LARGE_SCATTER_DEG, LARGE_SCATTER_MM = 1.0, 10.0  # more than most arms: worth a warning
 _BETTER = 4.0  # times, so that a mistake explains the disagreement
 _FINE_DEG, _FINE_MM = 1.0, 10.0  # views that disagree by less are not suspected
+_FEWEST = 4  # views with which a mistake is tried
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 
 
@@ -85,7 +86,7 @@ def _better(seen: Seen, poses: Poses, size: np.ndarray) -> str:
     """The mistake without which the views agree best, or "" if none makes a difference."""
     found: list[tuple[float, str]] = []
     for text, views in _hypotheses(seen, poses):
-        if views is None or len(views) < MIN_VIEWS:
+        if len(views) < max(_FEWEST, 0.7 * len(seen)):
             continue
         for factor, unit in ((1.0, ""), (1e-3, "millimetres")):
             arm = views.arm.copy()
@@ -94,10 +95,9 @@ def _better(seen: Seen, poses: Poses, size: np.ndarray) -> str:
                 other = disagreement(dc.replace(views, arm=arm))
             except ConfigError:
                 continue
-            gain = (size + 1e-9) / (other + 1e-9)
-            # Fewer millimetres alone say little where a wrong unit makes all lengths small.
-            fits = gain.max() > _BETTER and gain.min() > 0.8 and other[0] < 3 * MAX_SCATTER_DEG
-            fits = fits and (factor == 1 or other[1] < MAX_SCATTER_MM)
+            gain = (size * _freedom(seen) + 1e-9) / (other * _freedom(views) + 1e-9)
+            fits = gain.max() > _BETTER and gain.min() > 0.8
+            fits = fits and other[0] < 3 * MAX_SCATTER_DEG and other[1] < 3 * MAX_SCATTER_MM
             if fits and (text or unit):
                 score = float(np.log(gain).sum())
                 what = text.format(unit and f" and in {unit}") if text else "as millimetres: X_BE is in m"
@@ -105,7 +105,12 @@ def _better(seen: Seen, poses: Poses, size: np.ndarray) -> str:
     return max(found, default=(0.0, ""))[1]
 
 
-def _hypotheses(seen: Seen, poses: Poses) -> list[tuple[str, Seen | None]]:
+def _freedom(seen: Seen) -> float:
+    """By how much residuals are too small because they made the fit: three views nearly fit anything."""
+    return math.sqrt(len(seen) / (len(seen) - 2))
+
+
+def _hypotheses(seen: Seen, poses: Poses) -> list[tuple[str, Seen]]:
     """What to say, and the views with the mistake undone. {} stands for a second mistake."""
     mount = (
         "the camera is not beside the robot (leave out --eye-to-hand)"
@@ -113,7 +118,7 @@ def _hypotheses(seen: Seen, poses: Poses) -> list[tuple[str, Seen | None]]:
         else "the camera stands beside the robot (say --eye-to-hand)"
     )
     inverse = np.array([frames.inverse(X) for X in seen.arm])
-    out: list[tuple[str, Seen | None]] = [
+    out: list[tuple[str, Seen]] = [
         ("", seen),
         ("inverted{}: either they are X_EB instead of X_BE, or " + mount, dc.replace(seen, arm=inverse)),
         ("with the rotations transposed{}: X_BE holds the axes of E in its columns", _turned(seen, lambda R: R.T)),
