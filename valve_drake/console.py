@@ -8,7 +8,7 @@ given as `styled(text, style)` or `style=`, never as markup.
 import sys
 import unicodedata
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -50,7 +50,7 @@ def console(stderr: bool = False) -> "Console":
     from rich.console import Console
 
     class Harmless(Console):
-        def render_str(self, text: str, **options: object) -> "Text":  # every text passes here, table cells too
+        def render_str(self, text: str, **options: Any) -> "Text":  # every text passes here, table cells too
             return super().render_str(printable(text), **options)
 
     return Harmless(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=True)

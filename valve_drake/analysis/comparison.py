@@ -34,7 +34,7 @@ class Divergence(NamedTuple):
             change = "only in the replay" if self.recorded is None else "not in the replay"
         return f"{self.topic} {self.field} {change}".replace("  ", " ")
 
-    def as_json(self) -> dict:
+    def as_json(self) -> dict[str, Any]:
         plain = {key: _plain(value) for key, value in self._asdict().items()}
         return {"time_s": plain.pop("time")} | plain
 
@@ -113,6 +113,7 @@ class Comparison:
         self._replayed = []
 
     def _compare_next(self, replayed: list[tuple[str, bytes]]) -> None:
+        assert self._next is not None
         when, records = self._next
         self._compare(when, [(record.topic, record.data) for record in records], replayed)
         self._next = next(self._recorded, None)
@@ -180,7 +181,7 @@ def differences(a: Any, b: Any, path: str = "") -> list[tuple[str, Any, Any]]:
     return _all(differences(getattr(a, name, None), getattr(b, name, None), prefix + name) for name in names)
 
 
-def _all(parts: Iterable[list]) -> list:
+def _all(parts: Iterable[list[tuple[str, Any, Any]]]) -> list[tuple[str, Any, Any]]:
     return list(itertools.chain.from_iterable(parts))
 
 

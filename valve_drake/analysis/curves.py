@@ -39,7 +39,7 @@ def make_plots(log: Traces) -> list[Plot]:
 
 
 def _distance(log: Traces) -> Plot:
-    lines = []
+    lines: list[Line] = []
     found = log.estimates
     if found is not None and log.truth is not None and log.joints is not None:
         time = log.joints.time[::8]
@@ -71,7 +71,7 @@ def _position_error(log: Traces) -> Plot:
 def _position(log: Traces) -> Plot:
     """Without truth: how the estimate of what does not move wanders."""
     found = log.estimates
-    lines = []
+    lines: list[Line] = []
     if found is not None and len(found.time):
         p = found.X_OV[:, :, 3]
         R_OL = found.X_OV[:, :, :3] @ found.X_LV[:, :, :3].transpose(0, 2, 1)
@@ -96,7 +96,7 @@ def _angle_error(log: Traces) -> Plot:
 
 def _pose_error(log: Traces, title: str, unit: str, scale: float, first: int, note: str, key: str) -> Plot:
     found = log.estimates
-    lines = []
+    lines: list[Line] = []
     if found is not None and len(found.time) and np.isfinite(found.error).all():
         for k, (axis, color) in enumerate(AXES):
             error, sigma = scale * found.error[:, first + k], scale * found.sigma[:, first + k]
@@ -127,7 +127,7 @@ def _by_side(series: dict[str, np.ndarray] | None, what: str, scale: float) -> l
 
 
 def _forces(log: Traces) -> Plot:
-    lines = []
+    lines: list[Line] = []
     if (turn := log.turn) is not None:
         t = turn["time"]
         lines = [Line(f"{side} hand", t, turn[f"force_{side}"], SIDE_COLORS[side]) for side in SIDES]
@@ -143,7 +143,7 @@ def _forces(log: Traces) -> Plot:
 
 
 def _couple(log: Traces) -> Plot:
-    lines = []
+    lines: list[Line] = []
     if (turn := log.turn) is not None:
         t = turn["time"]
         lines = [Line("couple on the valve", t, turn["torque"], BLACK)]
@@ -152,7 +152,7 @@ def _couple(log: Traces) -> Plot:
 
 
 def _angle(log: Traces) -> Plot:
-    lines = []
+    lines: list[Line] = []
     scale = math.degrees(1)
     if log.truth is not None:
         lines.append(Line("true", log.truth.time, scale * log.truth.angle, GREY))
@@ -168,7 +168,7 @@ def _angle(log: Traces) -> Plot:
 
 
 def _angle_difference(log: Traces) -> Plot:
-    lines = []
+    lines: list[Line] = []
     scale = math.degrees(1)
     if (truth := log.truth) is not None:
         if log.turn is not None:
@@ -196,7 +196,7 @@ def _angle_difference(log: Traces) -> Plot:
 
 def _tracking(log: Traces) -> Plot:
     groups = [("torso", TORSO, GREEN)] + [(f"{side} arm", ARMS[side], SIDE_COLORS[side]) for side in SIDES]
-    lines = []
+    lines: list[Line] = []
     if log.joints is not None:
         for label, names, color in groups:
             error = np.abs(log.joints.error(names))
@@ -206,7 +206,7 @@ def _tracking(log: Traces) -> Plot:
 
 
 def _health(log: Traces) -> Plot:
-    lines = []
+    lines: list[Line] = []
     if log.health is not None:
         time, devices, ages = log.health
         groups = (

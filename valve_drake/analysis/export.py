@@ -7,7 +7,7 @@ elements that have a name. Arrays are flat and row-major, as in the log. Bytes (
 import csv
 import io
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,7 @@ def leaves(message: Message | Proto, path: str = "") -> dict[str, Any]:
     """The fields of a message by dotted path: numbers, texts, and arrays as they are."""
     if isinstance(message, Vector):
         return {"message_time": message.time} | dict(zip(message.names, message.values.tolist()))
+    fields: Iterable[tuple[str, Any]]
     if isinstance(message, Message):
         fields = vars(message).items()
     else:
@@ -136,5 +137,5 @@ def _stacked(values: list[Any]) -> np.ndarray:
     shape = np.max([a.shape for a in arrays], axis=0)
     out = np.full((len(arrays), *shape), np.nan)
     for k, a in enumerate(arrays):
-        out[(k, *(slice(n) for n in a.shape))] = a
+        out[k][tuple(slice(n) for n in a.shape)] = a
     return out

@@ -150,7 +150,7 @@ def _row(topic: str, schema: str, time: np.ndarray, number: np.ndarray, start: f
     edges = np.concatenate([[start], time, [end]]) if len(time) else np.array([start, end])
     if period is not None:
         wide = np.flatnonzero(np.diff(edges) > LATE * period)
-        gaps = [Gap(float(edges[k]), float(edges[k + 1]), _between(edges, k, period)) for k in wide]
+        gaps = [Gap(float(edges[k]), float(edges[k + 1]), _between(edges, int(k), period)) for k in wide]
     else:
         gaps = [Gap(float(edges[k]), float(edges[k + 1]), int(holes[k])) for k in np.flatnonzero(holes > 0)]
     return TopicRow(topic, schema, len(time), kind, period, median, lost, tuple(gaps), silence)

@@ -89,7 +89,7 @@ class Summary:
         return out
 
 
-def summarize(log: str | os.PathLike | LogReader | Traces) -> Summary:
+def summarize(log: str | os.PathLike[str] | LogReader | Traces) -> Summary:
     """The numbers of one log."""
     if not isinstance(log, Traces):
         log = Traces(log if isinstance(log, LogReader) else LogReader(log))

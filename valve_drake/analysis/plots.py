@@ -7,10 +7,12 @@ to change its viewBox. Lines keep their width by `vector-effect`; points are lin
 import dataclasses as dc
 import math
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 from markupsafe import Markup, escape
 
+from valve_drake.analysis.traces import ModeSpan
 from valve_drake.messages import Mode
 
 WIDTH, LEFT, RIGHT, BOTTOM = 1120, 62, 10, 20  # [px]
@@ -18,6 +20,7 @@ BUCKETS = 1400  # across a plot: of each, least and greatest value are drawn
 BREAK = 0.3  # a line is not drawn across a longer silence [s]
 BAND_BREAK = 1.1  # the same for bands [s]
 _MODES = frozenset(Mode)
+_Axis: TypeAlias = Callable[[Any], np.ndarray]
 
 
 @dc.dataclass(frozen=True)
@@ -51,7 +54,7 @@ class Plot:
     high: float | None = None
     key: str = ""  # for tests and links
 
-    def svg(self, spans: Sequence, start: float, end: float) -> Markup:
+    def svg(self, spans: Sequence[ModeSpan], start: float, end: float) -> Markup:
         """The plot from `start` to `end` with the modes' spans behind it."""
         forward, _ = _scale(self.knee)
         low, high = self._limits(forward)
@@ -86,7 +89,7 @@ class Plot:
         out.append("</svg></svg>")
         return Markup("".join(out))
 
-    def _limits(self, forward: Callable) -> tuple[float, float]:
+    def _limits(self, forward: _Axis) -> tuple[float, float]:
         values = [forward(line.value[np.isfinite(line.value)]) for line in self.lines]
         values += [forward(np.array([v])) for v in (self.low, self.high) if v is not None]
         values = [v for v in values if len(v)]
@@ -106,7 +109,7 @@ class Plot:
         return sorted([-v for v in sizes] + [0.0] + sizes)
 
 
-def shades(spans: Iterable, tall: float) -> str:
+def shades(spans: Iterable[ModeSpan], tall: float) -> str:
     """The modes as tinted areas, in seconds across."""
     rows = ((mode_class(span.mode), span.start, span.duration) for span in spans)
     return "".join(
@@ -157,7 +160,7 @@ def thin(time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return time[at], value[at]
 
 
-def _scale(knee: float) -> tuple[Callable, Callable]:
+def _scale(knee: float) -> tuple[_Axis, _Axis]:
     """Value -> axis and back."""
     if knee:
         return (lambda v: np.arcsinh(np.asarray(v) / knee)), (lambda a: np.sinh(a) * knee)
@@ -168,7 +171,7 @@ def _kind(line: Line) -> str:
     return line.style if line.style != "line" else "dashed" if line.dashed else "line"
 
 
-def _path(line: Line, y: Callable) -> str:
+def _path(line: Line, y: _Axis) -> str:
     good = np.isfinite(line.value)
     time, value = line.time[good], line.value[good]
     if line.style != "line":
@@ -183,10 +186,11 @@ def _path(line: Line, y: Callable) -> str:
     return "".join(out)
 
 
-def _band(line: Line, y: Callable) -> str:
+def _band(line: Line, y: _Axis) -> str:
     """Two standard deviations to both sides; a single point gets a whisker."""
-    good = np.isfinite(line.value) & np.isfinite(line.sigma)
-    time, value, wide = line.time[good], line.value[good], 2 * line.sigma[good]
+    sigma = np.zeros_like(line.value) if line.sigma is None else line.sigma
+    good = np.isfinite(line.value) & np.isfinite(sigma)
+    time, value, wide = line.time[good], line.value[good], 2 * sigma[good]
     areas, whiskers = [], []
     for part in np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > BAND_BREAK) + 1):
         top, low = y(value[part] + wide[part]).tolist(), y(value[part] - wide[part]).tolist()

@@ -8,7 +8,7 @@ import functools
 import math
 import os
 import urllib.parse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,7 @@ class Review:
         return self.log.path.name
 
 
-def review(path: str | os.PathLike) -> Review:
+def review(path: str | os.PathLike[str]) -> Review:
     """Reads a log, whatever its state. Raises ConfigError if it is none."""
     log = LogReader(path)
     traces = Traces(log)
@@ -156,8 +156,9 @@ def compare(a: Review, b: Review) -> Comparison:
 def comparison_facts(found: Comparison) -> dict[str, Any]:
     """The object of `review A B --json`."""
     pairs = [
-        {"mode": (x or y).mode, "a_s": x.duration if x else None, "b_s": y.duration if y else None}
+        {"mode": one.mode, "a_s": x.duration if x else None, "b_s": y.duration if y else None}
         for x, y in found.modes
+        if (one := x or y)
     ]
     out = {
         "a": str(found.a.log.path),
@@ -291,7 +292,9 @@ def writer(log: LogReader) -> str:
     return f"written by {name}, not by {LIBRARY}: topics and counts are shown, and what is in this program's schemas"
 
 
-def _drawn(traces: Traces, plots: Sequence[Plot], spans: Sequence[ModeSpan], start: float, end: float) -> list:
+def _drawn(
+    traces: Traces, plots: Sequence[Plot], spans: Sequence[ModeSpan], start: float, end: float
+) -> list[tuple[Plot, Markup]]:
     """(plot, its SVG) of those that can be drawn."""
     drawn = [
         (plot, traces.attempt(f"plot {plot.key}", functools.partial(plot.svg, spans, start, end), None))
@@ -387,7 +390,7 @@ def tiles(s: Summary, pace: Pace | None = None) -> list[tuple[str, str, str]]:
         )
         add("left hand\u2019s share", s.turn_share_left, lambda v: f"{100 * v:.1f} %", "of the couple")
     rest = s.estimates.get(Mode.MEASURE)
-    if rest is not None and rest.position_rms_m is not None:
+    if rest is not None and rest.position_rms_m is not None and rest.angle_rms_rad is not None:
         add(
             "pose measured at rest",
             rest.position_rms_m,
@@ -411,10 +414,9 @@ def _off(value: float | None, other: float | None, name: str = "truth") -> str:
 
 
 def _worst(found: Review, album: Album) -> Moment | None:
-    time = found.summary.worst_estimate_time_s
-    if time is None:
+    time, estimates = found.summary.worst_estimate_time_s, found.traces.estimates
+    if time is None or estimates is None:
         return None
-    estimates = found.traces.estimates
     k = int(np.argmin(np.abs(estimates.time - time)))
     error = 1e3 * np.linalg.norm(estimates.position_error[k])
     what = f"{error:.1f} mm" if math.isfinite(error) else f"residual {estimates.residual_px[k]:.2f} px"
@@ -428,7 +430,12 @@ def _log_lines(log: LogReader) -> list[tuple[float, str, str, int]]:
         return []
     if log.topics["/log"].schema != "foxglove.Log" or log.topics["/log"].count > MOST:
         return []
-    return [(t, m.name, m.message, m.level) for _, t, m in log.messages(["/log"])]
+    return [(t, m.name, m.message, m.level) for _, t, m in _foreign(log, "/log")]
+
+
+def _foreign(log: LogReader, topic: str) -> Iterator[tuple[str, float, Any]]:
+    """Messages in Foxglove's schemas, whose fields no checker knows."""
+    return log.messages([topic])
 
 
 def _parsed(text: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ and the *nominal* head: an error of the head's mount counts as an error of the e
 import dataclasses as dc
 import functools
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -37,6 +37,7 @@ SCHEMAS = {  # of the topics that are read here
 MOST, LARGEST = 1_000_000, 1 << 20  # messages of a topic that are decoded; of one of them [bytes]
 MOST_SPANS = 2000  # stays in modes
 T = TypeVar("T")
+D = TypeVar("D")
 HALF_TURN = make(rot_z(np.pi), np.zeros(3))
 
 
@@ -118,7 +119,7 @@ class Truth:
     angle: np.ndarray  # turned since the start, positive opens (N,) [rad]
 
 
-class _Trace(functools.cached_property, Generic[T]):
+class _Trace(functools.cached_property[T | None]):
     """A time series, read when it is first asked for; None where the log's values make none."""
 
     def __init__(self, make: Callable[["Traces"], T]):
@@ -136,7 +137,7 @@ class Traces:
         self.reader = reader
         self.missing: dict[str, str] = {}
 
-    def attempt(self, name: str, make: Callable[[], T], default: T) -> T:
+    def attempt(self, name: str, make: Callable[[], T], default: D) -> T | D:
         """What `make` gives, or `default` and a line in `missing`.
 
         A log can hold messages of the right schema and no sense (a damaged file, another program): vectors of any
@@ -326,7 +327,8 @@ class Traces:
     @functools.cached_property
     def faults(self) -> list[tuple[float, str]]:
         """When which fault was first reported."""
-        out, before = [], set()
+        out: list[tuple[float, str]] = []
+        before: set[str] = set()
         for time, health in self.reports:
             now = set(health.faults) | ({"emergency stop"} if health.estop else set())
             out += [(time, fault) for fault in sorted(now - before)]

@@ -72,7 +72,7 @@ def number_rows(a: Summary, b: Summary) -> list[tuple[str, float | None, float |
     return out
 
 
-def settings(a: dict, b: dict, path: str = "") -> list[tuple[str, Any, Any]]:
+def settings(a: dict[str, Any], b: dict[str, Any], path: str = "") -> list[tuple[str, Any, Any]]:
     """Keys of two scenarios whose values differ; None where one has none."""
     out: list[tuple[str, Any, Any]] = []
     for key in dict.fromkeys((*a, *b)):
@@ -133,7 +133,9 @@ def _record(log: LogReader, topic: str, at: tuple[int, int] | None) -> Record | 
 
 def _divergence(topic: str, x: Record | None, y: Record | None, a: LogReader, b: LogReader) -> Divergence:
     if x is None or y is None:
-        return Divergence((x or y).time, topic, "", x and "", y and "")
+        one = x or y
+        assert one is not None
+        return Divergence(one.time, topic, "", x and "", y and "")
     if x.when != y.when:
         return Divergence(min(x.time, y.time), topic, "(time)", x.time, y.time)
     try:

@@ -3,12 +3,16 @@
 import argparse
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from valve_drake import outputs
 from valve_drake.checks import ConfigError
 from valve_drake.commands.common import DAMAGED, OK, Subcommands, print_summary
 from valve_drake.console import console as make_console
 from valve_drake.console import say, styled
+
+if TYPE_CHECKING:
+    from valve_drake.analysis.report import Comparison, Review
 
 MOST_TOPICS = 30  # of another program's log, on the terminal
 
@@ -36,51 +40,57 @@ def command(options: argparse.Namespace) -> int:
     if html is not None:
         html = outputs.check(html, "--html", options.logs, report.was_made)
     found = [report.review(log) for log in options.logs]
-    if len(found) == 1:
-        subject, facts, page = found[0], report.facts, report.page
-    else:
-        subject, facts, page = report.compare(*found), report.comparison_facts, report.comparison_page
+    both = report.compare(*found) if len(found) == 2 else None
     if html is not None:
-        outputs.write(html, page(subject, html.parent.resolve()))
+        beside = html.parent.resolve()
+        outputs.write(html, report.comparison_page(both, beside) if both else report.page(found[0], beside))
     if options.json:
-        print(json.dumps(facts(subject) | {"html": str(html) if html else None}))
+        facts = report.comparison_facts(both) if both else report.facts(found[0])
+        print(json.dumps(facts | {"html": str(html) if html else None}))
     else:
-        _print_review(found, subject)
+        for one in found:
+            _print_review(one, str(one.log.path) if both else "")
+        if both:
+            _print_parting(both)
         say(f"page {html}")
     return OK if all(one.integrity.sound for one in found) else DAMAGED
 
 
-def _print_review(found: list, subject: object) -> None:
+def _print_review(one: "Review", name: str) -> None:
+    """What is known of one log; `name` heads it if there are two."""
     from valve_drake.analysis import report
 
     console = make_console()
-    for one in found:
-        if len(found) > 1:
-            console.print(f"{one.log.path}:")
-        if one.log.own or one.summary.spans:
-            print_summary(console, one.summary)
-        if not one.log.own:
-            console.print(f"{one.log.path} was {report.writer(one.log)}")
-            for topic in one.integrity.topics[:MOST_TOPICS]:
-                console.print(f"  {topic.topic}  {topic.schema or '-'}  {topic.count}")
-            if len(one.integrity.topics) > MOST_TOPICS:
-                console.print(f"  and {len(one.integrity.topics) - MOST_TOPICS} more")
-        for line in one.integrity.troubles:
-            console.print(f"damaged: {line}")
-        for row in one.integrity.late[:10]:
-            missing = sum(gap.missing for gap in row.gaps)
-            console.print(f"gaps: {row.topic} {len(row.gaps)}, {missing} messages missing")
-        whole = "whole" if one.integrity.sound else "not whole"
-        console.print(f"the log is {whole}: {one.integrity.messages} messages, {len(one.integrity.topics)} topics")
-    if len(found) == 1:
-        return
-    first = subject.first
+    if name:
+        console.print(f"{name}:")
+    if one.log.own or one.summary.spans:
+        print_summary(console, one.summary)
+    if not one.log.own:
+        console.print(f"{one.log.path} was {report.writer(one.log)}")
+        for topic in one.integrity.topics[:MOST_TOPICS]:
+            console.print(f"  {topic.topic}  {topic.schema or '-'}  {topic.count}")
+        if len(one.integrity.topics) > MOST_TOPICS:
+            console.print(f"  and {len(one.integrity.topics) - MOST_TOPICS} more")
+    for line in one.integrity.troubles:
+        console.print(f"damaged: {line}")
+    for row in one.integrity.late[:10]:
+        missing = sum(gap.missing for gap in row.gaps)
+        console.print(f"gaps: {row.topic} {len(row.gaps)}, {missing} messages missing")
+    whole = "whole" if one.integrity.sound else "not whole"
+    console.print(f"the log is {whole}: {one.integrity.messages} messages, {len(one.integrity.topics)} topics")
+
+
+def _print_parting(both: "Comparison") -> None:
+    """Where two logs part."""
+    from valve_drake.analysis import report
+
+    console, first = make_console(), both.first
     if first is None:
-        word = ("identical", "bold green") if subject.sound else "no difference"
+        word = ("identical", "bold green") if both.sound else "no difference"
         console.print(styled(word, ": what both hold is equal to the bit"))
         return
     a, b = report.parting_values(first)
-    words = f"{first.field}: {a} and {b}" if first.field else f"only in {found[0 if b is None else 1].log.path}"
+    words = f"{first.field}: {a} and {b}" if first.field else f"only in {(both.a if b is None else both.b).log.path}"
     console.print(f"they part at t = {first.time:.6f} s, {first.topic} {words}")
 
 

@@ -9,6 +9,7 @@ import collections
 import os
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -90,9 +91,8 @@ class McapFile:
         content = b"".join(chunk.parts)
         times = [when for index in chunk.index.values() for when in index[0::2]]
         data = zstandard.compress(content)
-        span = {"message_start_time": min(times, default=0), "message_end_time": max(times, default=0)}
-        sizes = {"compression": "zstd", "uncompressed_size": len(content)}
-        offset, length = self._add(records.Chunk(data=data, uncompressed_crc=zlib.crc32(content), **span, **sizes))
+        start, end = min(times, default=0), max(times, default=0)
+        offset, length = self._add(records.Chunk("zstd", data, end, start, zlib.crc32(content), len(content)))
         offsets = {}
         for channel, index in chunk.index.items():
             body = struct.pack(f"<HI{len(index)}Q", channel, 8 * len(index), *index)
@@ -105,9 +105,11 @@ class McapFile:
                 chunk_length=length,
                 message_index_offsets=offsets,
                 message_index_length=self._position - offset - length,
+                compression="zstd",
                 compressed_size=len(data),
-                **span,
-                **sizes,
+                message_end_time=end,
+                message_start_time=start,
+                uncompressed_size=len(content),
             )
         )
 
@@ -152,7 +154,7 @@ class McapFile:
             metadata_count=len(self._metadata),
             schema_count=len(schemas),
         )
-        groups = {
+        groups: dict[Opcode, Sequence[records.McapRecord]] = {
             Opcode.SCHEMA: schemas,
             Opcode.CHANNEL: channels,
             Opcode.STATISTICS: [statistics],

@@ -221,7 +221,7 @@ def mode_event(state: ModeState) -> Event:
     return event
 
 
-def log(time: float, name: str, text: str, level: int = Log.INFO) -> Log:
+def log(time: float, name: str, text: str, level: Log.Level.ValueType = Log.INFO) -> Log:
     """One line for people; `name`: who says it."""
     return Log(timestamp=stamp(time), level=level, name=name, message=text)
 

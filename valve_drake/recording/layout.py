@@ -102,7 +102,7 @@ def _split(direction: str, first: Any, second: Any, percentage: float) -> dict[s
     return {"direction": direction, "first": first, "second": second, "splitPercentage": percentage}
 
 
-def _even(direction: str, nodes: list) -> Any:
+def _even(direction: str, nodes: list[Any]) -> Any:
     """Nodes of equal size side by side."""
     if len(nodes) == 1:
         return nodes[0]

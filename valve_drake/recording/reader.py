@@ -127,7 +127,7 @@ class LogReader:
         """
         names = list(fields)
         times: list[float] = []
-        columns: dict[str, list] = {name: [] for name in names}
+        columns: dict[str, list[Any]] = {name: [] for name in names}
         for _, time, message in self.messages([topic]):
             times.append(time)
             for name, column in columns.items():
@@ -258,7 +258,7 @@ def _reach(value: Any, names: list[str]) -> Any:
     return value
 
 
-def _stack(column: list) -> np.ndarray:
+def _stack(column: list[Any]) -> np.ndarray:
     """Values as one array (N, ...): None as NaN of the others' shape; objects when shapes differ."""
     shapes = {np.shape(value) for value in column if value is not None}
     if len(shapes) > 1:

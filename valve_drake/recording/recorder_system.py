@@ -112,7 +112,7 @@ class RecorderSystem(LeafSystem):
         rows = [row for row in self._rows if row.every in due]
         return rows, list(dict.fromkeys(port for row in rows for port in row.ports))
 
-    def _write(self, signal: Signal, time: float, values: list) -> None:
+    def _write(self, signal: Signal, time: float, values: list[Any]) -> None:
         message = signal.encode(time, *values)
         if message is not None:
             self._sink.write(signal.topic, serialized(message), time)  # once, however many sinks there are
@@ -155,7 +155,7 @@ class _Row:
         self._always = signal.key is None and all(isinstance(port.kind, int) for port in ports)
         self._last: Any = None
 
-    def news(self) -> list | None:
+    def news(self) -> list[Any] | None:
         """The values to write, if any. Messages compare by identity."""
         values = [port.value for port in self.ports]
         if self.watched:

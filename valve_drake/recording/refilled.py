@@ -30,11 +30,11 @@ class Refilled:
         self._kind = type(form)
         data = form.SerializeToString(deterministic=True)
         slots = {k: data.index(struct.pack("<Q", _SLOTS + k)) for k in range(count)}
-        order = sorted(slots, key=slots.get)
+        order = sorted(slots, key=lambda k: slots[k])
         self._arrange = operator.itemgetter(*order)
         begins, ends = [0, *(slots[k] + 8 for k in order)], [*(slots[k] for k in order), len(data)]
         between = [data[begin:end] for begin, end in zip(begins, ends)]
-        self._pieces: list = [piece for part in between for piece in (part, None)][:-1]
+        self._pieces: list[bytes | None] = [piece for part in between for piece in (part, None)][:-1]
         self._pack = struct.Struct("<" + "d".join(f"{len(part)}s" for part in between)).pack
         self._timed = _STAMP in data
 

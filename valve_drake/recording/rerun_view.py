@@ -19,11 +19,11 @@ from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 
 from valve_drake.checks import ConfigError
+from valve_drake.messages import CAMERAS
 from valve_drake.recording.layout import PLOTS
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recovery import recover
 from valve_drake.recording.robot_frames import ODOMETRY
-from valve_drake.stations.contract import CAMERAS
 
 APPLICATION = "valve_drake"
 SCENE = "/scene"
@@ -43,7 +43,7 @@ def blueprint(log: LogReader) -> Any:
         return archetype.visualizer(mappings=[mapping])
 
     def plot(title: str, paths: dict[str, str]) -> Any:
-        lines: dict[str, list] = {}
+        lines: dict[str, list[Any]] = {}
         for label, path in paths.items():
             topic, dot, field = path.partition(".")
             if topic in log.topics and "{" not in field:  # there is no way to ask for a joint by its name
@@ -74,7 +74,7 @@ def log_bodies(recording: Any, log: LogReader) -> None:
     """The bodies' meshes, each in its frame, for all times. `recording`: a rerun.RecordingStream."""
     import rerun as rr
 
-    scene = next((message for _, _, message in log.messages([SCENE])), None) if SCENE in log.topics else None
+    scene: Any = next((message for _, _, message in log.messages([SCENE])), None) if SCENE in log.topics else None
     for entity in scene.entities if scene else ():
         parts = [(mesh.pose, _mesh(mesh)) for mesh in entity.triangles] + [(c.pose, _cube(c)) for c in entity.cubes]
         for k, (pose, part) in enumerate(parts):

@@ -20,7 +20,7 @@ Part = tuple[str, Shape, np.ndarray, Iterable[float]]
 
 def parts_of(inspector: SceneGraphInspector) -> list[Part]:
     """Everything that has an illustration role; frames carry SceneGraph's names ("robot::chest")."""
-    parts = []
+    parts: list[Part] = []
     for geometry in inspector.GetAllGeometryIds(Role.kIllustration):
         properties = inspector.GetIllustrationProperties(geometry)
         colored = properties.HasProperty("phong", "diffuse")

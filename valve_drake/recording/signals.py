@@ -11,6 +11,7 @@
 /truth/...                schemas.Vector: simulation only; left out when the ports are not connected
 """
 
+import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -68,10 +69,10 @@ OUTPUTS: tuple[tuple[str, str, type[Message]], ...] = (  # block, port, kind: re
 
 FRAMES: dict[str, tuple[str, type[Message], Callable[[Any], CameraFrame]]] = {  # camera -> who looks at its images
     **{
-        f"head_{side}": ("color_segmentation.segmentation", SegmentationPair, lambda m, s=side: getattr(m, s).frame)
+        f"head_{side}": ("color_segmentation.segmentation", SegmentationPair, operator.attrgetter(f"{side}.frame"))
         for side in SIDES
     },
-    **{f"{side}_wrist": ("handle_marker.marks", HandleMarks, lambda m, s=side: getattr(m, s).frame) for side in SIDES},
+    **{f"{side}_wrist": ("handle_marker.marks", HandleMarks, operator.attrgetter(f"{side}.frame")) for side in SIDES},
 }
 
 BELIEF: dict[str, type[Message]] = {  # what the 3D view is made of
@@ -236,7 +237,9 @@ def calibration(camera: str, size: tuple[int, int], K: np.ndarray) -> Signal:
     return Signal(f"/{camera}/calibration", {}, lambda time: foxglove.calibration(camera, time, size, K), period=1.0)
 
 
-def transforms(inputs: Mapping[str, type[Message]], frames: Callable[..., Iterable], period: float = SLOW) -> Signal:
+def transforms(
+    inputs: Mapping[str, type[Message]], frames: Callable[..., Iterable[Any]], period: float = SLOW
+) -> Signal:
     """Frames computed from messages, valid at the first message's time."""
 
     def encode(time: float, *messages: Any) -> Encoded:
@@ -262,7 +265,7 @@ def log_line(port: str, kind: type[Message], encode: Callable[[Any], Log | None]
 def status_line(block: str) -> Signal:
     """What a behaviour says when its state changes."""
 
-    def key(status: Status) -> tuple:
+    def key(status: Status) -> tuple[Any, ...]:
         return status.activation, status.state, status.verdict
 
     return log_line(f"{block}.status", Status, lambda status: foxglove.status_log(block, status), key)
@@ -276,7 +279,7 @@ def health_line() -> Signal:
 def mode_events(port: str = "supervisor.mode") -> list[Signal]:
     """Every change of mode, and the verdict, brought to the disk at once."""
 
-    def key(state: ModeState) -> tuple:
+    def key(state: ModeState) -> tuple[Any, ...]:
         return state.mode, state.activation, state.verdict
 
     return [

@@ -46,7 +46,7 @@ class LogWriter:
     path: the log's name, the next free one if `path` is taken (ActiveFile, also for the arguments); `note` says so.
     """
 
-    def __init__(self, path: str | os.PathLike, *, companions: Sequence[str] = (), overwrite: bool = False):
+    def __init__(self, path: str | os.PathLike[str], *, companions: Sequence[str] = (), overwrite: bool = False):
         self._file = ActiveFile(Path(path), companions, overwrite)
         self.path, self.note = self._file.path, self._file.note
         self._mcap = McapFile(self._file.file)
@@ -57,7 +57,7 @@ class LogWriter:
         self._handed, self._written = 0, 0  # bytes, to the thread and by it
         self._error = ""
         self._told = self._closed = False
-        self._jobs: queue.SimpleQueue = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[tuple[int, Callable[..., object], tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="log writer", daemon=True)
         self._thread.start()
 
@@ -163,7 +163,7 @@ class LogWriter:
             self._hand_over(self._chunk.size, self._mcap.add_chunk, self._chunk)
             self._chunk = Chunk()
 
-    def _hand_over(self, size: int, job: Callable, *args: Any) -> None:
+    def _hand_over(self, size: int, job: Callable[..., object], *args: Any) -> None:
         self._handed += size
         if self._handed - self._written > MAX_BACKLOG:
             self._stop(f"the disk is {MAX_BACKLOG >> 20} MiB behind")
