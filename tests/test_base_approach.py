@@ -262,8 +262,10 @@ def test_fine_approach_brakes_for_a_stance_at_the_very_edge_of_the_forbidden_zon
     assert CONFIG.clearance < scene.clear(run.poses) < CONFIG.clearance + 0.02
 
 
-def test_fine_approach_refuses_a_stance_within_the_clearance():
-    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+@pytest.mark.parametrize("depth", [0.05, MARKER.panel_depth, 0.30])
+def test_fine_approach_refuses_a_stance_within_the_clearance(depth):
+    """By 5 cm: with a short stem the panel is nearer than with the usual one, and the stance with it."""
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0, depth=depth)
     run = drive(
         Mode.FINE_APPROACH,
         Wheels(place(scene, 0.0, 1.6)),

@@ -40,8 +40,15 @@ class Rule:
 
     def bounds(self, place: int | str) -> tuple[float, float]:
         """Bounds of a list's entry or of a group's key (whichever it is, of a single number)."""
-        low, high = (side if isinstance(side, int | float) else side[place] for side in (self.low, self.high))
-        return low, high
+        return _at(self.low, place), _at(self.high, place)
+
+
+def _at(bound: Bound | None, place: int | str) -> float:
+    if bound is None:
+        raise TypeError("a number without bounds")
+    if isinstance(bound, Mapping):
+        return bound[str(place)]
+    return bound if isinstance(bound, int | float) else bound[int(place)]
 
 
 def number(default: Any, low: float, high: float, about: str) -> Any:
