@@ -87,6 +87,13 @@ def test_a_missing_file_and_one_that_is_not_yaml(tmp_path):
     assert mut.dump(mut.load(str(empty))) == mut.dump(mut.Scenario())
 
 
+@pytest.mark.parametrize("name", ["n" * 5000, "a\0b", "\udce9.yaml", "/dev/null", ".", ""])
+def test_a_name_that_no_scenario_has_gives_one_short_line(name):
+    with pytest.raises(ConfigError) as caught:
+        mut.load(name or "/")
+    assert str(caught.value).startswith("no such file: ") and len(str(caught.value)) < 300
+
+
 def test_loading_twice_shares_nothing():
     a, b = mut.load(), mut.load()
     a.marker.size[0] = 0.05

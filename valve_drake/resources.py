@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from valve_drake.checks import ConfigError
+from valve_drake.checks import MAX_SHOWN, ConfigError, shown
 
 _HERE = Path(__file__).resolve().parent
 
@@ -24,8 +24,11 @@ def diagrams() -> Path:
 
 
 def find(path: str, base: Path) -> Path:
-    """`path` as given if it exists, else below `base`. Raises ConfigError if neither does."""
+    """`path` as given if it is a regular file, else below `base`. Raises ConfigError if neither is."""
     for candidate in (Path(path), base / path):
-        if candidate.is_file():
-            return candidate
-    raise ConfigError(f"no such file: {path}")
+        try:
+            if candidate.is_file():
+                return candidate
+        except (OSError, ValueError):  # a name that is too long, or that no file can have
+            pass
+    raise ConfigError(f"no such file: {path if len(path) <= MAX_SHOWN else shown(path)}")

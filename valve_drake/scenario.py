@@ -52,8 +52,8 @@ STATIONS = ("simulated", "hardware", "replay")
 class Scenario(Config):
     """Everything that a run depends on."""
 
-    seed: int = number(0, 0, 2**31 - 1, "of all that chance decides")
-    station: str = choice("simulated", STATIONS, "which robot")
+    seed: int = number(0, 0, 2**31 - 1, "of all random numbers")
+    station: str = choice("simulated", STATIONS, "the robot that the blocks are wired to")
     command: str = choice("open", ("open", "close"), "what to do with the valve")
     angle: float = number(1.5707963267948966, 0.01, 6.29, "to turn [rad]")
     time_limit: float = number(240.0, 0.1, 3600.0, "of the whole run [s]")
@@ -75,7 +75,9 @@ class Scenario(Config):
     command_selector: CommandSelectorConfig = dc.field(default_factory=CommandSelectorConfig)
     simulation: SimulationConfig = dc.field(default_factory=SimulationConfig)
     hardware: HardwareConfig = dc.field(default_factory=HardwareConfig)
-    faults: list[FaultConfig] = dc.field(default_factory=list, metadata=config.about("of the twin, on purpose"))
+    faults: list[FaultConfig] = dc.field(
+        default_factory=list, metadata=config.about("that the twin simulates (valve_drake/stations/faults.py)")
+    )
 
     def check(self, key: str | None = None) -> None:
         for length in self.marker.size:  # first: what else is wrong with a marker that large is no help
