@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses as dc
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import cv2
 from pydrake.lcm import DrakeLcm
@@ -17,6 +17,7 @@ from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.faults import Faults
 from valve_drake.stations.hardware import RobotLink
+from valve_drake.stations.reports import listed
 from valve_drake.stations.twin import LiveImages, Twin
 
 
@@ -28,6 +29,7 @@ class Rehearsed:
     valve_start: float  # opened since closed [rad]
     valve_end: float
     pace: Pace | None
+    dropped: Mapping[str, int]  # bad messages, by what they were for
 
     def as_json(self) -> dict:
         """The object of `twin --json`."""
@@ -38,6 +40,7 @@ class Rehearsed:
             "valve_end_rad": self.valve_end,
             "missed_ticks": self.pace and self.pace.missed,
             "ticks": self.pace and self.pace.ticks,
+            "dropped_messages": dict(self.dropped),
         }
 
 
@@ -98,8 +101,10 @@ def run_twin(
                 twin.wait()
             else:
                 pacer.tick(lambda: _tick(twin, pacer))
+        if twin.dropped:
+            notice(f"bad messages of the program were dropped: {listed(twin.dropped)}")
         end = float(twin.read("truth.valve_angle")[0])
-        return Rehearsed(twin.time, begin, end, pacer and pacer.report(twin.time))
+        return Rehearsed(twin.time, begin, end, pacer and pacer.report(twin.time), twin.dropped)
 
 
 def _tick(twin: Twin, pacer: Pacer) -> None:

@@ -5,6 +5,7 @@ Every process on a bus says a random number of its own, so that two robots, or t
 """
 
 import dataclasses as dc
+import functools
 import secrets
 import time as wall
 from collections.abc import Callable, Mapping
@@ -63,7 +64,7 @@ class Bus:
                 raise OperationFailed(f"LCM cannot open {config.lcm_url}: {str(error).splitlines()[0]}") from error
         self.lcm = lcm
         for role, key in PRESENCE.items():
-            self._subscribe(CHANNELS[key], lambda key, message, role=role: self._present(role, message))
+            self._subscribe(CHANNELS[key], functools.partial(self._present, role))
 
     def listen(self, sender: str, heard: Callable[[str, Any], None]) -> None:
         """Hears all that `sender` says."""
@@ -122,7 +123,7 @@ class Bus:
         return self._names[key]
 
     # ------------------------------------------------------------ who is there
-    def _present(self, role: str, message: Any) -> None:
+    def _present(self, role: str, key: str, message: Any) -> None:
         try:
             number = 0.0 if isinstance(message, BadMessage) else read_presence(message)
         except WrongMessage:

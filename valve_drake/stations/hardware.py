@@ -59,7 +59,7 @@ from valve_drake.stations.lcm_channels import (
     read_named,
     to_utime,
 )
-from valve_drake.stations.reports import BadMessages, LeastDelay, Lockstep, Stamps
+from valve_drake.stations.reports import BadMessages, LeastDelay, Lockstep, Stamps, listed
 
 NEVER_STILL = tuple(row.key for row in REPORTS if row.device.endswith("wrist_sensor"))
 SPEEDS = ("base.odometry", *(f"{side}_arm.velocity_measured" for side in SIDES))  # ports that tell of motion
@@ -452,8 +452,10 @@ class RobotLink:
             self._sent_mode = self._new_mode = (mode, activation)
 
     def leave(self) -> None:
-        """Lock-step: the robot need not wait any longer. It is told when it has answered the last tick: a channel has
-        room for one message."""
+        """The end of a run: says what was dropped. In lock-step the robot need not wait any longer; it is told when
+        it has answered the last tick, since a channel has room for one message."""
+        if self.dropped:
+            self._notice(f"bad messages of the robot were dropped: {listed(self.dropped)}")
         if self._config.lockstep:
             if self._lockstep.tick == self._answered:
                 self._await_tick(self._answered + 1)

@@ -58,7 +58,7 @@ class Channel:
 
     key: str
     sender: str
-    kind: type
+    kind: Any  # LCM's class
     rate: str
     fields: str  # units and signs, for people
     write: Callable[[Values], Any] | None = None  # values -> message without its stamp; None: made by its sender

@@ -114,6 +114,11 @@ class BadMessages:
                 yield record.words
 
 
+def listed(counts: Mapping[str, int]) -> str:
+    """For people: "torso 3, head_left 1"."""
+    return ", ".join(f"{device} {count}" for device, count in counts.items())
+
+
 class Senders:
     """Who speaks for a role ("robot", "controller"): every process says its own random number."""
 

@@ -246,6 +246,11 @@ class Twin:
         """Of the present tick [s]."""
         return self.tick * TICK
 
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """How many bad messages were dropped so far, by what they were for."""
+        return self._bad.counts
+
     def read(self, port: str) -> np.ndarray:
         return self.station.GetOutputPort(port).Eval(self.context)
 
