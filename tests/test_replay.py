@@ -382,6 +382,11 @@ def test_equal_messages_are_identical_and_the_truth_is_left_out(small):
     assert all(topic.equal == 3 for topic in found.topics.values())
 
 
+def test_bytes_of_a_type_that_had_other_fields_are_no_message_of_todays(small):
+    found = compared(small)
+    assert found._canonical("/a/command", b"") == b"" and found._canonical("/a/command", b"\x0f") is None
+
+
 def test_the_first_difference_of_a_tick_is_that_of_the_topic_that_comes_first(small):
     def change(topic, k, message):
         if k == 0:

@@ -280,6 +280,8 @@ def test_the_3d_view_takes_the_next_free_port_and_says_which(here, capsys):
     ("arguments", "words"),
     [
         (["run", "nowhere.yaml"], "no such file: nowhere.yaml"),
+        (["run", "a" * 5000], "no such file: "),
+        (["run", "--set", f"taught={'a' * 5000}"], "no such file: "),
         (["run", "--set", "valve.height=1"], "unknown key valve"),
         (["run", "--set", "simulation.valve.height=nan"], "finite number"),
         (["run", "--set", "marker.size=[0.3, 0.3]"], "panel"),

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from google.protobuf.message import Message as Proto
 
 from valve_drake.messages import Message
@@ -155,9 +156,15 @@ class Comparison:
             if isinstance(a, float) and isinstance(b, float) and abs(a - b) > total.max_difference:
                 total.largest = change
 
-    def _canonical(self, topic: str, data: bytes) -> bytes:
-        """Protobuf has several ways to write down the same message (refilled.py); this is its own."""
-        return self._kinds[topic].FromString(data).SerializeToString(deterministic=True)
+    def _canonical(self, topic: str, data: bytes) -> bytes | None:
+        """Protobuf has several ways to write down the same message (refilled.py); this is its own.
+
+        None for the message of a program whose type of that name had other fields.
+        """
+        try:
+            return self._kinds[topic].FromString(data).SerializeToString(deterministic=True)
+        except DecodeError:
+            return None
 
 
 def differences(a: Any, b: Any, path: str = "") -> list[tuple[str, Any, Any]]:
