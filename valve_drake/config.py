@@ -225,6 +225,8 @@ def _build(given: Any, kind: Any, default: Any, key: str, source: str, unknown: 
         }
     if origin in (typing.Union, types.UnionType):  # Number
         if isinstance(given, yaml_file.Tagged):
+            if not isinstance(given.tree, dict) or not {"min", "max"} <= set(given.tree):
+                raise _wrong(given.tree, f"{UNIFORM} {{min: a, max: b}}", key, source)
             return _build(given.tree, Uniform, None, key, source, unknown)
         kind = float
     return _scalar(given, kind, key, source)
