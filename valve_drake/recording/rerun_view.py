@@ -7,6 +7,7 @@ are added here as meshes in the log's frames, and which fields to plot, which th
 Needs the `rerun` extra.
 """
 
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,7 +19,9 @@ from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 
-from valve_drake.checks import ConfigError
+from valve_drake import outputs
+from valve_drake.checks import ConfigError, OperationFailed
+from valve_drake.console import complain, say
 from valve_drake.messages import CAMERAS
 from valve_drake.recording.layout import PLOTS
 from valve_drake.recording.reader import LogReader
@@ -105,18 +108,20 @@ def _rgba(color: Color) -> list[float]:
 def write(source: Path, out: Path) -> list[str]:
     """Writes what can be read of the log `source` as Rerun's recording `out` -> the log's damage, in lines.
 
-    Raises ConfigError if `source` is no log, the extra is missing or Rerun fails.
+    Raises ConfigError if `source` is no log, the extra is missing, Rerun fails or `out` is a file of another kind.
     """
+    out = outputs.check(out, "the Rerun recording", [source], _is_recording)
     try:
         import rerun as rr
     except ImportError:
         raise ConfigError("this needs the rerun-sdk package: pip install 'valve-drake[rerun]'") from None
     log, same = LogReader(source), {"application_id": APPLICATION, "recording_id": source.stem}
     with tempfile.TemporaryDirectory() as folder:
-        messages, bodies, views = (Path(folder) / name for name in ("messages.rrd", "bodies.rrd", "views.rbl"))
+        names = ("messages.rrd", "bodies.rrd", "views.rbl", "all.rrd")
+        messages, bodies, views, whole = (Path(folder) / name for name in names)
         if log.damage:  # Rerun would read nothing of it
-            recover(source, whole := Path(folder) / "whole.mcap")
-            source = whole
+            recover(source, sound := Path(folder) / "sound.mcap")
+            source = sound
         options = [f"--{key.replace('_', '-')}={value}" for key, value in same.items()]
         _rerun("mcap", "convert", source, *options, "--timeline-type=duration", "-o", messages)
         with rr.RecordingStream(**same) as recording:
@@ -124,8 +129,15 @@ def write(source: Path, out: Path) -> list[str]:
             log_bodies(recording, log)
             recording.flush()
         blueprint(log).save(APPLICATION, views)
-        _rerun("rrd", "merge", messages, bodies, views, "-o", out)
+        _rerun("rrd", "merge", messages, bodies, views, "-o", whole)
+        with outputs.replacing(out) as file, open(whole, "rb") as made:
+            shutil.copyfileobj(made, file)
     return log.damage
+
+
+def _is_recording(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return file.read(3) == b"RRF"
 
 
 def _rerun(*arguments: str | Path) -> None:
@@ -142,10 +154,12 @@ def main(arguments: list[str]) -> int:
     out = source.with_suffix(".rrd")
     try:
         damage = write(source, out)
-    except ConfigError as error:
-        print(f"valve-drake: {error}", file=sys.stderr)
-        return 2
-    print(*(f"damaged: {line}" for line in damage), f"rerun {out}", sep="\n")
+    except (ConfigError, OperationFailed) as error:
+        complain(error)
+        return 2 if isinstance(error, ConfigError) else 1
+    for line in damage:
+        say(f"damaged: {line}")
+    say(f"rerun {out}")
     return 3 if damage else 0
 
 
