@@ -32,8 +32,8 @@ from mcap_samples import (
 
 from valve_drake import cli
 from valve_drake.checks import ConfigError
-from valve_drake.messages import ModeState, Status
-from valve_drake.recording import contents, schemas
+from valve_drake.messages import CameraFrame, ModeState, Status
+from valve_drake.recording import contents, foxglove, schemas
 from valve_drake.recording import records as mcap_records
 from valve_drake.recording.container import LIBRARY
 from valve_drake.recording.reader import LogReader
@@ -486,6 +486,22 @@ def test_schemas_that_are_none_leave_a_page(tmp_path, capsys, data, encoding, to
     path = Sample((schema, channel, *MESSAGES)).write(tmp_path / "a.mcap")
     code, out, _ = run(capsys, "review", path)
     assert code == 0 and "10 messages" in out and (tmp_path / "a.review.html").stat().st_size > 1000
+
+
+def test_an_image_that_claims_gigabytes_is_not_decoded(tmp_path, capsys):
+    head = struct.pack(">IIBBBBB", 30000, 30000, 8, 2, 0, 0, 0)
+    parts = ((b"IHDR", head), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b""))
+    png = b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in parts
+    )
+    frame = foxglove.image(CameraFrame("head_left", 0.01, 0, data=png))
+
+    def mode(k):
+        return ModeState(time=k / 32, mode="turn", activation=k, since=k / 32)
+
+    path = log_of(tmp_path / "a.mcap", ("/head_left/image", lambda k: frame), ("/supervisor/mode", mode))
+    assert run(capsys, "review", path)[0] == 0
+    assert "cannot be decoded" in (tmp_path / "a.review.html").read_text()
 
 
 def test_a_log_of_one_message_a_topic_has_a_page(tmp_path, capsys):

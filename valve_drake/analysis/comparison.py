@@ -1,4 +1,4 @@
-"""Messages held against the recorded ones, tick by tick: equal to the bit, or where and by how much not."""
+"""Compares messages with the recorded ones, tick by tick: bit-equal, or where they differ and by how much."""
 
 import dataclasses as dc
 import itertools
@@ -16,8 +16,11 @@ from valve_drake.recording import schemas
 from valve_drake.recording.foxglove import NANO, nanoseconds
 from valve_drake.recording.reader import LogReader, Record
 
-UNCOMPARED = ("/truth/", PACE)  # begin the topics that no block says: a simulation's own, and the wall clock's
-LONGEST = 60  # of a value in a report [characters]
+UNCOMPARED = (
+    "/truth/",
+    PACE,
+)  # prefixes of topics that no block writes: they come from the simulator and the wall clock
+LONGEST = 60  # values in a report are cut to this [characters]
 
 
 class Divergence(NamedTuple):
@@ -95,7 +98,7 @@ class Comparison:
         self._replayed.append((topic, data))
 
     def flush(self) -> None:
-        """Nothing is kept back."""
+        """Does nothing: no message is buffered."""
 
     def finish(self) -> None:
         """Compares what is left when all has been written."""
@@ -138,7 +141,7 @@ class Comparison:
                     self._note(when, topic, before, after)
 
     def _note(self, when: int, topic: str, before: bytes | None, after: bytes | None) -> None:
-        """Takes down how two messages differ."""
+        """Records the differences of two messages."""
         total = self.topics[topic]
         if before is None or after is None:
             found = [("", None if before is None else "", None if after is None else "")]

@@ -69,7 +69,7 @@ def _position_error(log: Traces) -> Plot:
 
 
 def _position(log: Traces) -> Plot:
-    """Without truth: how the estimate of what does not move wanders."""
+    """Without truth: the estimate in odometry's frame, minus its median: a marker at rest should not move."""
     found = log.estimates
     lines: list[Line] = []
     if found is not None and len(found.time):

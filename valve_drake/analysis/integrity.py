@@ -14,13 +14,13 @@ from valve_drake.recording.signals import BEHAVIORS, SLOW, TRUTH
 
 CAMERAS = HEAD + WRIST
 
-# What the recorder itself writes at every period. A test holds these tables to signals.py.
+# Topics that the recorder writes at every period. A test compares these tables with signals.py.
 PERIODS: dict[str, float] = {
     **{topic: TICK for topic in ("/joint_states", "/joint_commands", *(f"/{side}_wrist/wrench" for side in SIDES))},
     **{"/" + port.replace(".", "/"): SLOW for port in TRUTH},
     **{f"/{camera}/calibration": 1.0 for camera in CAMERAS},
 }
-# What a block says at every one of its steps, from the first to the last: its rate is the one seen in the log.
+# Outputs that a block writes at every step: the expected rate is the median rate of the log itself.
 STEADY = frozenset(
     (
         *(f"/{block}/command" for block in BEHAVIORS),
@@ -30,7 +30,7 @@ STEADY = frozenset(
     )
     + ("/command_selector/report", "/supervisor/mode", "/robot_state/robot_state", "/health", "/tf")
 )
-# What follows the cameras: only images that the mode asks for are taken, so there is no rate over the run.
+# Topics that follow the cameras: images are taken only when the mode asks for them, so no rate is expected.
 GATED = frozenset(
     ("/color_segmentation/segmentation", "/line_fitting/edges", "/stereo_positioning/position", "/handle_marker/marks")
     + ("/rectangle_estimator/estimate", "/rectangle_estimator/pose")
@@ -38,7 +38,7 @@ GATED = frozenset(
 )
 RESULT = "result"  # metadata that a run writes when it ends
 MOST, MOST_OF_A_TOPIC = 10_000_000, 4_000_000  # messages whose times are held in memory, some 90 bytes each
-LATE = 1.5  # periods after which a message is late
+LATE = 1.5  # a message that comes later than this many periods after the last one counts as a gap
 
 
 @dc.dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Gap:
 
 @dc.dataclass(frozen=True)
 class TopicRow:
-    """One topic's share of a log. kind: steady, gated (follows the cameras), changes (written when it
+    """One topic of a log. kind: steady, gated (follows the cameras), changes (written when it
     changes) or many (more messages than can be examined)."""
 
     topic: str

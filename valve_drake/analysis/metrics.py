@@ -1,4 +1,4 @@
-"""From a log to numbers: what happened in a run. Reads nothing but the log (through traces.py)."""
+"""The numbers of a run, computed from its log alone (by way of traces.py)."""
 
 import dataclasses as dc
 import functools
@@ -12,7 +12,7 @@ from valve_drake.recording.reader import LogReader
 from valve_drake.recording.signals import TORSO
 from valve_drake.supervisor.supervisor import TERMINAL
 
-LOADED = 1.0  # couple above which the hands' shares mean something [N m]
+LOADED = 1.0  # below this couple the hands' shares are noise and are left out [N m]
 
 
 @dc.dataclass(frozen=True)

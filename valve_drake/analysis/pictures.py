@@ -11,13 +11,14 @@ from markupsafe import Markup, escape
 
 from valve_drake.analysis.integrity import CAMERAS
 from valve_drake.analysis.traces import ModeSpan
+from valve_drake.camera.image_file import decode
 from valve_drake.checks import ConfigError
 from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.reader import LogReader
 
 THUMB, QUALITY = 400, 80  # width [px], JPEG
-OLD = 2.2  # an older image does not show the moment [s]
-TEXTS = 3  # of the detections' words, in one image
+OLD = 2.2  # images captured longer before a moment are not shown for it [s]
+TEXTS = 3  # labels of detections in one image; more would cover it
 
 
 @dc.dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Thumbnail:
 
 @dc.dataclass(frozen=True)
 class Moment:
-    """A time worth a look, with the newest image of each camera that had one."""
+    """A time of interest, with the newest image of each camera that took one."""
 
     time: float
     title: str
@@ -66,12 +67,12 @@ class Album:
         images = [m for _, m in _messages(self._log, f"/{camera}/image", logged, logged) if _capture(m) == captured]
         if not images:
             return None
-        raw = np.frombuffer(images[-1].data, np.uint8)
-        image = cv2.imdecode(raw, cv2.IMREAD_COLOR) if len(raw) else None
-        if image is None:
+        try:
+            image = decode(images[-1].data, camera)
+        except ConfigError:
             return Thumbnail(camera, captured, (640, 480), "", Markup(""))
         height, width = image.shape[:2]
-        size = (THUMB, round(THUMB * height / width))
+        size = (THUMB, min(max(round(THUMB * height / width), 1), 4 * THUMB))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
         seen = _messages(self._log, f"/{camera}/detections", logged, logged + 0.1)

@@ -16,9 +16,9 @@ from valve_drake.analysis.traces import ModeSpan
 from valve_drake.messages import Mode
 
 WIDTH, LEFT, RIGHT, BOTTOM = 1120, 62, 10, 20  # [px]
-BUCKETS = 1400  # across a plot: of each, least and greatest value are drawn
-BREAK = 0.3  # a line is not drawn across a longer silence [s]
-BAND_BREAK = 1.1  # the same for bands [s]
+BUCKETS = 1400  # columns of a plot; the least and the greatest value of each are drawn
+BREAK = 0.3  # a line is interrupted where no message came for longer [s]
+BAND_BREAK = 1.1  # the same for bands; raise it for estimates at a lower rate [s]
 _MODES = frozenset(Mode)
 _Axis: TypeAlias = Callable[[Any], np.ndarray]
 

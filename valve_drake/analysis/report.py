@@ -1,4 +1,4 @@
-"""From a log to one HTML page that shows what happened: self-contained, nothing is loaded from anywhere.
+"""Makes one self-contained HTML page of a log (or of two): it loads nothing from the network.
 
 `review` reads a log into facts, `page` and `comparison_page` make HTML of them, `facts` gives the same to programs.
 """
@@ -33,9 +33,9 @@ from valve_drake.recording.reader import LogReader
 
 MADE = "Made by <code>valve-drake review</code>"  # in every page, see the templates
 AT_REST = (Mode.MEASURE, Mode.VERIFY)
-MOMENTS = 200  # changes of mode that are shown with pictures
-ROW = 22  # of the timeline [px]
-LONGEST = 48  # text of a value where two logs part [characters]
+MOMENTS = 200  # changes of mode that are shown with pictures; raise it for runs with more
+ROW = 22  # height of a row of the timeline [px]
+LONGEST = 48  # values are cut to this where two logs differ [characters]
 
 
 @dc.dataclass
@@ -78,7 +78,7 @@ def review(path: str | os.PathLike[str]) -> Review:
 
 
 def _pace(log: LogReader) -> Pace | None:
-    """The last that the log says of it: it counts from the beginning."""
+    """The last /pace message: its numbers count from the start of the run. None if there is none."""
     found = log.topics.get(PACE)
     if found is None or not found.count or found.schema != "valve_drake.Pace":
         return None
@@ -86,35 +86,35 @@ def _pace(log: LogReader) -> Pace | None:
     return last if isinstance(last, Pace) and all(math.isfinite(v) for v in vars(last).values()) else None
 
 
-def facts(found: Review) -> dict[str, Any]:
+def facts(review: Review) -> dict[str, Any]:
     """The object of `review --json`."""
-    values = dc.asdict(found.summary)
+    values = dc.asdict(review.summary)
     spans = values.pop("spans")
     values.pop("outcome")
     topics = [
         {"topic": r.topic, "schema": r.schema, "messages": r.count, "kind": r.kind, "period_s": r.period_s}
         | {"median_period_s": r.median_s, "lost": r.lost, "gaps": [dc.asdict(gap) for gap in r.gaps]}
-        for r in found.integrity.topics
+        for r in review.integrity.topics
     ]
     out = {
-        "log": str(found.log.path),
-        "outcome": found.summary.outcome or "unfinished",
-        "library": found.log.library,
-        "own": found.log.own,
-        "sound": found.integrity.sound,
-        "finished": found.integrity.finished,
-        "damage": found.integrity.troubles,
-        "messages": found.integrity.messages,
-        "lost": found.integrity.lost,
-        "missing_topics": found.traces.missing,
+        "log": str(review.log.path),
+        "outcome": review.summary.outcome or "unfinished",
+        "library": review.log.library,
+        "own": review.log.own,
+        "sound": review.integrity.sound,
+        "finished": review.integrity.finished,
+        "damage": review.integrity.troubles,
+        "messages": review.integrity.messages,
+        "lost": review.integrity.lost,
+        "missing_topics": review.traces.missing,
         **values,
         "modes": spans,
-        "mode_durations_s": found.summary.mode_durations(),
+        "mode_durations_s": review.summary.mode_durations(),
         "topics": topics,
-        "recording": str(found.recording) if found.recording else None,
-        "pace": found.pace and found.pace.as_json(),
-        "run": found.run,
-        "scenario": found.scenario,
+        "recording": str(review.recording) if review.recording else None,
+        "pace": review.pace and review.pace.as_json(),
+        "run": review.run,
+        "scenario": review.scenario,
     }
     return plain(out)
 
@@ -153,28 +153,31 @@ def compare(a: Review, b: Review) -> Comparison:
     )
 
 
-def comparison_facts(found: Comparison) -> dict[str, Any]:
+def comparison_facts(comparison: Comparison) -> dict[str, Any]:
     """The object of `review A B --json`."""
     pairs = [
         {"mode": one.mode, "a_s": x.duration if x else None, "b_s": y.duration if y else None}
-        for x, y in found.modes
+        for x, y in comparison.modes
         if (one := x or y)
     ]
     out = {
-        "a": str(found.a.log.path),
-        "b": str(found.b.log.path),
-        "identical": found.first is None and found.sound,
-        "sound": found.sound,
-        "damage": {"a": found.a.integrity.troubles, "b": found.b.integrity.troubles},
-        "outcomes": {"a": found.a.summary.outcome or "unfinished", "b": found.b.summary.outcome or "unfinished"},
-        "verdicts": {"a": found.a.summary.verdict, "b": found.b.summary.verdict},
-        "first_divergence": _parting(found.first),
+        "a": str(comparison.a.log.path),
+        "b": str(comparison.b.log.path),
+        "identical": comparison.first is None and comparison.sound,
+        "sound": comparison.sound,
+        "damage": {"a": comparison.a.integrity.troubles, "b": comparison.b.integrity.troubles},
+        "outcomes": {
+            "a": comparison.a.summary.outcome or "unfinished",
+            "b": comparison.b.summary.outcome or "unfinished",
+        },
+        "verdicts": {"a": comparison.a.summary.verdict, "b": comparison.b.summary.verdict},
+        "first_divergence": _parting(comparison.first),
         "modes": pairs,
-        "numbers": {name: {"a": x, "b": y, "difference": d} for name, x, y, d in found.numbers},
-        "settings": {key: {"a": x, "b": y} for key, x, y in found.settings + found.versions},
+        "numbers": {name: {"a": x, "b": y, "difference": d} for name, x, y, d in comparison.numbers},
+        "settings": {key: {"a": x, "b": y} for key, x, y in comparison.settings + comparison.versions},
         "topics": {
             pair.topic: {"a": pair.count_a, "b": pair.count_b, "equal": pair.equal, "first": _parting(pair.first)}
-            for pair in found.topics
+            for pair in comparison.topics
         },
     }
     return plain(out)
@@ -187,7 +190,7 @@ def _parting(found: Divergence | None) -> dict[str, Any] | None:
 
 
 def parting_values(found: Divergence) -> tuple[str | float | None, str | float | None]:
-    """What both logs have where they part: numbers as they are, else a short text; None for no message."""
+    """Both values at the first difference: numbers unchanged, others as short text, None where a log has no message."""
 
     def brief(value: Any) -> str | float | None:
         if value is None or isinstance(value, int | float):
@@ -219,32 +222,32 @@ def was_made(path: Path) -> bool:
 # ---------------------------------------------------------------- the page
 
 
-def page(found: Review, beside: Path) -> str:
-    """The page of one log; links are relative to the folder `beside`."""
-    start, end = _extent(found.log)
-    spans = found.traces.spans
-    plots = [plot for plot in make_plots(found.traces) if plot.lines]
-    album = Album(found.log)
-    worst = found.traces.attempt("worst estimate", lambda: _worst(found, album), None)
+def page(review: Review, link_base: Path) -> str:
+    """The page of one log; links are relative to the folder `link_base`."""
+    start, end = _extent(review.log)
+    spans = review.traces.spans
+    plots = [plot for plot in make_plots(review.traces) if plot.lines]
+    album = Album(review.log)
+    worst = review.traces.attempt("worst estimate", lambda: _worst(review, album), None)
     return (
         _environment()
         .get_template("review.html.j2")
         .render(
-            title=f"{found.name}: {found.summary.verdict or found.summary.outcome or 'unfinished'}",
-            r=found,
-            s=found.summary,
-            integrity=found.integrity,
-            tiles=tiles(found.summary, found.pace),
-            timeline=timeline(spans, start, end, found.integrity.gaps()),
-            writer=writer(found.log),
-            plots=_drawn(found.traces, plots, spans, start, end),
-            missing=found.traces.missing,
+            title=f"{review.name}: {review.summary.verdict or review.summary.outcome or 'unfinished'}",
+            r=review,
+            s=review.summary,
+            integrity=review.integrity,
+            tiles=tiles(review.summary, review.pace),
+            timeline=timeline(spans, start, end, review.integrity.gaps()),
+            writer=writer(review.log),
+            plots=_drawn(review.traces, plots, spans, start, end),
+            missing=review.traces.missing,
             spans=spans,
             span=(start, end),
-            moments=found.traces.attempt("pictures", lambda: album.changes_of_mode(spans[:MOMENTS]), []),
+            moments=review.traces.attempt("pictures", lambda: album.changes_of_mode(spans[:MOMENTS]), []),
             worst=worst,
-            log_lines=found.traces.attempt("/log", lambda: _log_lines(found.log), []),
-            recording=_link(found.recording, beside),
+            log_lines=review.traces.attempt("/log", lambda: _log_lines(review.log), []),
+            recording=_link(review.recording, link_base),
             geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
         )
     )
@@ -253,32 +256,32 @@ def page(found: Review, beside: Path) -> str:
 # ---------------------------------------------------------------- the page of two
 
 
-def comparison_page(found: Comparison, beside: Path) -> str:
-    """The page of two logs; links are relative to the folder `beside`."""
-    a, b = found.a, found.b
+def comparison_page(comparison: Comparison, link_base: Path) -> str:
+    """The page of two logs; links are relative to the folder `link_base`."""
+    a, b = comparison.a, comparison.b
     spans = a.traces.spans
     start, end = _extent(a.log)
-    plots = overlaid(make_plots(a.traces), make_plots(b.traces), found.modes)
+    plots = overlaid(make_plots(a.traces), make_plots(b.traces), comparison.modes)
     headline = {"modes", "estimates", "tracking", "mode_durations_s", "selector_limited", "selector_refused"}
-    main = [row for row in found.numbers if row[0].split(".")[0] not in headline]
+    main = [row for row in comparison.numbers if row[0].split(".")[0] not in headline]
     return (
         _environment()
         .get_template("compare.html.j2")
         .render(
             title=f"{a.name} and {b.name}",
-            c=found,
+            c=comparison,
             a=a,
             b=b,
-            first=found.first,
-            values=parting_values(found.first) if found.first else None,
+            first=comparison.first,
+            values=parting_values(comparison.first) if comparison.first else None,
             parting_values=parting_values,
             main=main,
-            others=[row for row in found.numbers if row not in main],
+            others=[row for row in comparison.numbers if row not in main],
             timelines=[timeline(r.traces.spans, *_extent(r.log), r.integrity.gaps()) for r in (a, b)],
             plots=_drawn(a.traces, plots, spans, start, end),
             spans=spans,
             span=(start, end),
-            recordings=[_link(r.recording, beside) for r in (a, b)],
+            recordings=[_link(r.recording, link_base) for r in (a, b)],
             geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},
         )
     )
@@ -303,9 +306,9 @@ def _drawn(
     return [(plot, svg) for plot, svg in drawn if svg is not None]
 
 
-def _link(path: Path | None, beside: Path) -> str | None:
+def _link(path: Path | None, link_base: Path) -> str | None:
     """A relative link to a file, as text of an URL: a name may hold what means something there."""
-    return urllib.parse.quote(os.fsencode(os.path.relpath(path, beside))) if path else None
+    return urllib.parse.quote(os.fsencode(os.path.relpath(path, link_base))) if path else None
 
 
 def _extent(log: LogReader) -> tuple[float, float]:
@@ -413,8 +416,8 @@ def _off(value: float | None, other: float | None, name: str = "truth") -> str:
     return f"{off:+.2f}\u00b0 to the {name}".replace("-", "\u2212")
 
 
-def _worst(found: Review, album: Album) -> Moment | None:
-    time, estimates = found.summary.worst_estimate_time_s, found.traces.estimates
+def _worst(review: Review, album: Album) -> Moment | None:
+    time, estimates = review.summary.worst_estimate_time_s, review.traces.estimates
     if time is None or estimates is None:
         return None
     k = int(np.argmin(np.abs(estimates.time - time)))

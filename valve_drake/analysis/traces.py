@@ -1,4 +1,4 @@
-"""From a log to time series: what the numbers (metrics.py) and the plots (report.py) are made of.
+"""Time series from a log, the input of the numbers (metrics.py) and the plots (curves.py).
 
 Truth: the true pose of the marker in the left head camera goes through the true base and marker, the measured torso
 and the *nominal* head: an error of the head's mount counts as an error of the estimate.
@@ -34,8 +34,9 @@ SCHEMAS = {  # of the topics that are read here
     "/truth/marker_pose": "valve_drake.Vector",
     "/truth/valve_angle": "valve_drake.Vector",
 }
-MOST, LARGEST = 1_000_000, 1 << 20  # messages of a topic that are decoded; of one of them [bytes]
-MOST_SPANS = 2000  # stays in modes
+# Bounds on memory: a topic with more messages is not decoded, a larger message [bytes] is left out, and of more stays
+# in modes the first are shown. Raise them for runs of hours.
+MOST, LARGEST, MOST_SPANS = 1_000_000, 1 << 20, 2000
 T = TypeVar("T")
 D = TypeVar("D")
 HALF_TURN = make(rot_z(np.pi), np.zeros(3))
@@ -73,7 +74,7 @@ class Estimates:
     cameras: np.ndarray
     angle_error: np.ndarray  # [rad]
     position_error: np.ndarray  # [m]
-    looked: int  # images pairs looked at, found or not
+    looked: int  # image pairs that were searched, with or without success
 
     @property
     def distance(self) -> np.ndarray:
@@ -111,7 +112,7 @@ class Joints:
 
 @dc.dataclass(frozen=True)
 class Truth:
-    """What only a simulation knows, each row at the instant when it was so."""
+    """Ground truth of a simulation; row k is valid at time[k]."""
 
     time: np.ndarray  # (N,) [s]
     base: np.ndarray  # x, y [m], heading [rad] in W, continuous (N, 3)
@@ -151,7 +152,7 @@ class Traces:
             return default
 
     def inside(self, time: np.ndarray, *modes: str) -> np.ndarray:
-        """Which of these instants fall into one of the modes -> (N,) bool."""
+        """Which instants `time` (N,) [s] lie in one of the modes -> (N,) bool."""
         found = np.zeros(len(time), bool)
         for span in self.spans:
             if span.mode in modes:
@@ -350,7 +351,7 @@ class Traces:
 
     @_Trace
     def verify_angle(self) -> float | None:
-        """What the camera saw after letting go [rad]."""
+        """The valve's angle by the cameras after the hands have let go [rad]; None if it was not measured."""
         verifying = {span.activation for span in self.spans if span.mode == Mode.VERIFY}
         angle = None
         for _, status in self._messages("/kinematic_approach/status"):

@@ -1,4 +1,4 @@
-"""Two runs side by side: modes and numbers that differ, what was set differently, and where the logs part."""
+"""Compares two logs: modes, numbers, settings, and the first message that differs."""
 
 import dataclasses as dc
 import difflib
@@ -42,7 +42,7 @@ def pair_modes(a: Sequence[ModeSpan], b: Sequence[ModeSpan]) -> Pairs:
 
 
 def onto(pairs: Pairs, time: np.ndarray) -> np.ndarray:
-    """Times of the second run on the axis of the first: each of its modes laid over the one beside it."""
+    """Maps times of the second run to the first one's axis: each mode is stretched to the length of its partner."""
     knots = [(b.start, a.start) for a, b in pairs if a and b] + [(b.end, a.end) for a, b in pairs if a and b]
     if not knots:
         return time

@@ -30,7 +30,11 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
     Raises ConfigError naming the file if it cannot be read, is no image, is damaged, or has more than MAX_PIXELS.
     """
     key = f"image {path}"
-    data = _read_bytes(path, key)
+    return decode(_read_bytes(path, key), key, flags)
+
+
+def decode(data: bytes, key: str, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
+    """As `read_image`, from a file's bytes; `key` names it in the error line."""
     size = _claimed_size(data)
     if size is None:
         raise ConfigError(f"{key}: not an image ({_KINDS})")

@@ -1,4 +1,4 @@
-"""The program's messages in Foxglove's schemas, which the viewers show without being told how.
+"""The program's messages in Foxglove's schemas, which viewers show without configuration.
 
 Frames agree with the viewers' (cameras: x right, y down, z forward). Pixels do not: here (0, 0) is the centre
 of the first pixel, in annotations its top-left corner. Half a pixel is added in this file and nowhere else.
@@ -79,7 +79,9 @@ def calibration(camera: str, time: float, size: tuple[int, int], K: np.ndarray) 
 def quaternions(R: np.ndarray) -> np.ndarray:
     """Rotation matrices (n, 3, 3) as unit quaternions x, y, z, w (n, 4)."""
     M = (R.reshape(-1, 9) @ _TO_SQUARE + np.eye(4).ravel()).reshape(-1, 4, 4)
-    q = M[np.arange(len(M)), M[:, range(4), range(4)].argmax(axis=1)]  # of the largest component: never ill-conditioned
+    q = M[
+        np.arange(len(M)), M[:, range(4), range(4)].argmax(axis=1)
+    ]  # the column of the largest component is well conditioned
     return q / np.sqrt((q * q).sum(axis=1, keepdims=True))
 
 

@@ -82,7 +82,7 @@ _TIMED = {"enabled": True, "timestampMethod": "receiveTime"}
 
 def _image(camera: str) -> dict[str, Any]:
     mode = {"imageTopic": f"/{camera}/image", "annotations": {f"/{camera}/detections": {"visible": True}}}
-    if camera in HEAD:  # nobody knows the wrist cameras' lens
+    if camera in HEAD:  # the wrist cameras are not calibrated
         mode["calibrationTopic"] = f"/{camera}/calibration"
     return {"imageMode": mode, "foxglovePanelTitle": camera}
 

@@ -15,7 +15,7 @@ from valve_drake.recording import schemas
 from valve_drake.recording.foxglove import NANO, nanoseconds
 
 HOST, PORT = "127.0.0.1", 8765
-CLOCK_PERIOD = NANO // 32  # between two words on the time to the clients [ns]
+CLOCK_PERIOD = NANO // 32  # the time is sent to the clients this often [ns]
 
 
 class LiveView:
@@ -70,7 +70,7 @@ class LiveView:
             channel.log(data, log_time=when)
 
     def flush(self) -> None:
-        """Nothing is kept back."""
+        """Does nothing: no message is buffered."""
 
     def close(self) -> None:
         self._server.stop()

@@ -1,4 +1,5 @@
-"""The recorder: whatever its table names, from a port through an encoder to a topic of the log."""
+"""The recorder: a System that reads ports, encodes their values and writes them to topics of the log, row by row of
+a table."""
 
 import dataclasses as dc
 import functools
@@ -53,7 +54,7 @@ class Signal:
     encode: Callable[..., Loggable | None]  # (time, *values) -> what to write; None: nothing
     period: float = TICK  # [s] a multiple of TICK, or ONCE
     key: Callable[..., Any] | None = None
-    urgent: bool = False  # brought to the disk at once
+    urgent: bool = False  # flushed to the disk at once
 
 
 class RecorderSystem(LeafSystem):
@@ -102,7 +103,7 @@ class RecorderSystem(LeafSystem):
                 port.read(context)
             for row in rows:
                 if row.watched and row.watched.value is row.seen:
-                    continue  # most rows at most ticks, so it is asked without a call
+                    continue  # true of most rows at most ticks, so it is tested here, without a call
                 if (values := row.news()) is not None:
                     self._write(row.signal, time, values)
 
@@ -150,7 +151,7 @@ class _Row:
         self.ports = ports
         self.every = ONCE if signal.period == ONCE else round(signal.period / TICK)  # [ticks]; 0 % ONCE is 0
         self.watched = ports[0] if len(ports) == 1 and not isinstance(ports[0].kind, int) else None
-        self.seen: Any = None  # of the port that is watched
+        self.seen: Any = None  # the watched port's value at the last tick
         self._key = signal.key
         self._always = signal.key is None and all(isinstance(port.kind, int) for port in ports)
         self._last: Any = None

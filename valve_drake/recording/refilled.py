@@ -1,4 +1,4 @@
-"""Messages that differ in numbers only, serialised by filling the numbers into the bytes of one of them.
+"""Serialises messages that differ in numbers only by writing the numbers into the bytes of a template.
 
 Protobuf writes a double as its 8 bytes. A message in which nothing changes but doubles and the time is thus the same
 string of bytes with others in known places; to fill them in costs a tenth of building and serialising it anew.
@@ -13,7 +13,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from valve_drake.recording.schemas import Encoded
 
-STAMP = Timestamp(seconds=2**31, nanos=999_999_999)  # stands for the time, wherever a form has it: the longest there is
+STAMP = Timestamp(seconds=2**31, nanos=999_999_999)  # placeholder for the time in a form; the longest encoding there is
 _STAMP = STAMP.SerializeToString()
 _SLOTS = 0x7A5A_C3A5_3C96_0000  # the bits of slot 0, which nothing else in a form has
 

@@ -1,4 +1,4 @@
-"""Where every body of robot and valve is, as the robot believes it, for the log's 3D view."""
+"""Poses of all bodies of robot and valve, computed from measurements and estimates, for the log's 3D view."""
 
 import numpy as np
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
@@ -17,7 +17,7 @@ ODOMETRY = "odometry"
 
 
 class RobotFrames:
-    """The controllers' own model, posed as measured. Frames are named as in SceneGraph ("robot::chest")."""
+    """The controllers' model of the robot in its measured pose. Frames are named as in SceneGraph ("robot::chest")."""
 
     def __init__(self, head: StereoHead, marker: Marker):
         builder = DiagramBuilder()

@@ -1,4 +1,4 @@
-"""The looks of robot, valve and room for the viewers' 3D panels: Drake's shapes as foxglove.SceneUpdate."""
+"""The visual shapes of robot, valve and room as foxglove.SceneUpdate, for the viewers' 3D panels."""
 
 from collections.abc import Iterable
 

@@ -47,7 +47,7 @@ from valve_drake.recording.recorder_system import ONCE, Signal
 from valve_drake.recording.refilled import STAMP, Refilled, slot
 from valve_drake.recording.schemas import Encoded, Vector, Wrench, proto_class, serialized
 
-SLOW = 1 / 32  # period of what is large, or only to be looked at [s]
+SLOW = 1 / 32  # period of large messages and of those that only people look at [s]
 BEHAVIORS = ("valve_search", "base_approach", "kinematic_approach", "image_servo", "hybrid_rotation")
 
 OUTPUTS: tuple[tuple[str, str, type[Message]], ...] = (  # block, port, kind: recorded as they are
@@ -119,7 +119,7 @@ for _side in SIDES:
         f"{_side}_gripper.force_limit": (f"{_side}_gripper.effort",),
     }
 
-JOINED = {"measured": MEASURED, "commanded": COMMANDED}  # the recorder reads these vectors as one: it costs less
+JOINED = {"measured": MEASURED, "commanded": COMMANDED}  # vectors that the recorder reads through one port: cheaper
 
 
 def signals(
@@ -142,7 +142,7 @@ def signals(
     rows += [calibration(camera, size, K) for camera, (size, K) in (calibrations or {}).items()]
     rows += [transforms(BELIEF, frames), marker_pose()]
     if scene is not None:
-        looks = serialized(scene)  # here, for it takes several ms
+        looks = serialized(scene)  # once, at the start: it takes several ms
         rows += [Signal("/scene", {}, lambda time: looks, period=ONCE)]
     rows += [*mode_events(), health_line(), *(status_line(block) for block in BEHAVIORS)]
     rows += [vector(topic_of(port), port, names, SLOW) for port, names in TRUTH.items()]
