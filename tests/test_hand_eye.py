@@ -108,11 +108,28 @@ def test_position_error_of_the_arm_is_not_paid_in_rotation():
 
 
 def test_no_published_method_is_better_and_the_covariance_is_honest():
-    rows = experiment.hand_eye(seed=0, trials=4, deg=(0.0, 0.2), mm=(0.0, 2.0))["rows"]
-    assert len(rows) == 8
+    rows = experiment.hand_eye(seed=0, trials=4, deg=(0.2,), mm=(0.0, 1.0))["rows"]
+    assert len(rows) == 4
     for what in ("rotation [deg]", "position [mm]"):
         assert sum(row[what] for row in rows) < 0.9 * sum(row[f"best {what}"] for row in rows)
     assert 0.7 < np.mean([row["NEES/6"] for row in rows]) < 1.3
+
+
+def test_a_small_board_is_taken_with_the_tilt_that_suits_the_arm():
+    # Of a board of 8 cm at 0.9 m, noise of half a pixel now and then makes the mirrored tilt the better fit.
+    small, rng = Board(5, 4, 0.02, 0.02), np.random.default_rng(9)
+    true = hand_poses(20)
+    back = frames.make(np.eye(3), np.array([0, 0, 0.5]))
+    far = [frames.compose(X, X_EC, frames.inverse(back), frames.inverse(X_EC)) for X in true]
+    corners = []
+    for X in far:
+        X_CT = frames.compose(frames.inverse(X_EC), frames.inverse(X), X_BT)
+        px = boards.corners(PAPER, X_CT, small.points())
+        corners.append(px + rng.normal(0, 0.5, px.shape))
+    seen = hand_eye.observe(PAPER, small.points(), corners, far)
+    wanted = np.array([frames.compose(frames.inverse(X_EC), frames.inverse(X), X_BT) for X in far])
+    tilted = [np.abs(one.board[:, :, 2] - wanted[:, :, 2]).max(1) > 0.3 for one in (seen, hand_eye.settled(seen))]
+    assert tilted[0].any() and not tilted[1].any()
 
 
 def test_a_blunder_is_left_out_and_named():

@@ -57,7 +57,7 @@ def _row(to_hand: bool, deg: float, mm: float, trials: int, rng: np.random.Gener
     for _ in range(trials):
         n = int(rng.integers(VIEWS[0], VIEWS[1] + 1))
         X, seen = scene(rng, n, to_hand, math.radians(deg), mm / 1e3)
-        fit = solver.solve(seen)
+        fit = solver.solve(solver.settled(seen))
         off = _off(fit.X, X)
         errors["this one"].append(off)
         nees.append(float(off @ np.linalg.solve(fit.covariance[:6, :6], off)) / 6)

@@ -42,6 +42,7 @@ MIN_VIEWS = 3
 STANDS_OUT = 5.0  # standard deviations (rms of six) beyond which a view is a blunder; no noise of an arm is so large
 _MAX_BLUNDERS = 0.25  # of the views that may be left out
 _MIN_PX = 1e-3  # the corners' noise is taken to be no less: drawn corners are exact
+_SURE = 30.0  # squared residuals, in units of the noise, by which the second pose of a board is out of the question
 _MAX_TURN = 0.3  # of one step [rad]
 _STEPS = 10  # of each variance's grid
 _VISIBLE = 0.1  # where that grid begins, as a share of the corners' own variance
@@ -59,6 +60,10 @@ class Seen:
     covariance: np.ndarray  # (n, 6, 6) of the board: turn about its axes [rad], displacement in C [m]
     to_hand: bool  # the camera stands beside the robot, the hand holds the board
     px: float  # standard deviation of a corner's coordinate [px]
+    # A small board tilted the other way may look nearly the same: the second pose, and by how much it is less likely.
+    second: np.ndarray  # (n, 3, 4)
+    second_covariance: np.ndarray  # (n, 6, 6)
+    second_cost: np.ndarray  # (n,) squared residuals in units of the noise; inf where there is none
 
     def __len__(self) -> int:
         return len(self.arm)
@@ -66,7 +71,8 @@ class Seen:
     def only(self, views: Sequence[int]) -> "Seen":
         """These views alone."""
         at = list(views)
-        return dc.replace(self, arm=self.arm[at], board=self.board[at], covariance=self.covariance[at])
+        names = ("arm", "board", "covariance", "second", "second_covariance", "second_cost")
+        return dc.replace(self, **{name: getattr(self, name)[at] for name in names})
 
     def carriers(self) -> np.ndarray:
         """(n, 3, 4) pose of what the hand-eye methods call the gripper: beside the robot, base and hand swap."""
@@ -129,25 +135,32 @@ class Method:
 
 def board_pose(lens: LensModel, points: np.ndarray, px: np.ndarray) -> np.ndarray:
     """X_CT (3, 4) of a planar board by its corners' least squares."""
-    return _board(lens, points, px)[0]
+    return _boards(lens, points, px)[0][0]
 
 
-def _board(lens: LensModel, points: np.ndarray, px: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """X_CT (3, 4), the information (6, 6) of corners with a noise of 1 px, and the sum of squared residuals [px^2]."""
-    xy = lens.normalize(px)
-    _, rvec, tvec = cv2.solvePnP(points, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-    rvec, tvec = cv2.solvePnPRefineLM(points, xy, np.eye(3), None, rvec, tvec)
-    X, S = transform(rvec, tvec), skew(points)
+def _boards(lens: LensModel, points: np.ndarray, px: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """The one or two poses that explain the corners, the better one first.
+
+    Each: X_CT (3, 4), the information (6, 6) of corners with a noise of 1 px, the sum of squared residuals [px^2].
+    """
+    xy, S = lens.normalize(px), skew(points)
     to_px = np.linalg.inv(lens.normalize_jacobian(px))  # the corners' noise is even in the raw image
-    for _ in range(3):
-        P = frames.apply(X, points)
-        at = P[:, :2] / P[:, 2:]
-        dP = np.concatenate([-X[:, :3] @ S, np.broadcast_to(np.eye(3), S.shape)], 2)
-        J = (to_px @ divided(at, P[:, 2]) @ dP).reshape(-1, 6)
-        r = (to_px @ (at - xy)[:, :, None]).ravel()
-        H = J.T @ J
-        X = stepped(X, -np.linalg.solve(H, J.T @ r))
-    return X, H, float(r @ r)
+    out = []
+    for rvec, tvec in zip(*cv2.solvePnPGeneric(points, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)[1:3]):
+        X = transform(*cv2.solvePnPRefineLM(points, xy, np.eye(3), None, rvec, tvec))
+        for _ in range(3):
+            P = frames.apply(X, points)
+            at = P[:, :2] / P[:, 2:]
+            dP = np.concatenate([-X[:, :3] @ S, np.broadcast_to(np.eye(3), S.shape)], 2)
+            J = (to_px @ divided(at, P[:, 2]) @ dP).reshape(-1, 6)
+            r = (to_px @ (at - xy)[:, :, None]).ravel()
+            H = J.T @ J
+            X = stepped(X, -np.linalg.solve(H, J.T @ r))
+        if np.isfinite(X).all() and X[2, 3] > 0:
+            out.append((X, H, float(r @ r)))
+    if not out:
+        raise ConfigError("hand-eye: the corners are not those of a board seen through this lens")
+    return sorted(out, key=lambda one: one[2])
 
 
 def observe(
@@ -158,11 +171,46 @@ def observe(
     to_hand: bool = False,
 ) -> Seen:
     """points (m, 3) in T, corners [(m, 2)] raw px and X_BE (3, 4) of each view."""
-    boards, information, squares = zip(*(_board(lens, points, px) for px in corners))
+    found = [_boards(lens, points, px) for px in corners]
     freedom = sum(2 * len(px) - 6 for px in corners)
-    px = max(math.sqrt(sum(squares) / max(freedom, 1)), _MIN_PX)
-    covariance = px**2 * np.linalg.inv(np.array(information))
-    return Seen(np.array(X_BE, float), np.array(boards), covariance, to_hand, px)
+    px = max(math.sqrt(sum(one[0][2] for one in found) / max(freedom, 1)), _MIN_PX)
+    cost = np.array([(one[-1][2] - one[0][2]) / px**2 for one in found])
+    same = [np.abs(one[-1][0] - one[0][0]).max() < 1e-6 for one in found]
+    return Seen(
+        arm=np.array(X_BE, float),
+        board=np.array([one[0][0] for one in found]),
+        covariance=px**2 * np.linalg.inv(np.array([one[0][1] for one in found])),
+        to_hand=to_hand,
+        px=px,
+        second=np.array([one[-1][0] for one in found]),
+        second_covariance=px**2 * np.linalg.inv(np.array([one[-1][1] for one in found])),
+        second_cost=np.where(same | (cost > _SURE), np.inf, cost),
+    )
+
+
+def settled(seen: Seen, used: Sequence[int] | None = None) -> Seen:
+    """The views with the one of two board poses that suits the arm, as the views `used` have it."""
+    for _ in range(3):
+        if not np.isfinite(seen.second_cost).any():
+            break
+        fit = solve(seen if used is None else seen.only(used))
+        other = dc.replace(
+            seen,
+            board=seen.second,
+            covariance=seen.second_covariance,
+            second=seen.board,
+            second_covariance=seen.covariance,
+            second_cost=-seen.second_cost,
+        )
+        better = 6 * deviations(fit, other) ** 2 + seen.second_cost < 6 * deviations(fit, seen) ** 2
+        if not better.any():
+            break
+        chosen = {}
+        for name in ("board", "covariance", "second", "second_covariance", "second_cost"):
+            mine, theirs = getattr(seen, name), getattr(other, name)
+            chosen[name] = np.where(better.reshape(-1, *[1] * (mine.ndim - 1)), theirs, mine)
+        seen = dc.replace(seen, **chosen)
+    return seen
 
 
 def _arm_errors(X: np.ndarray, Y: np.ndarray, seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -409,6 +457,7 @@ def hand_eye(
 def from_seen(seen: Seen, lens: LensModel, points: np.ndarray, corners: Sequence[np.ndarray]) -> HandEye:
     """As `hand_eye`, of views observed already."""
     closed_hand_eye(seen.carriers(), seen.board)  # refuses what no view determines
+    seen = settled(seen, majority(seen))
     used = majority(seen)
     if len(seen) - len(used) > _MAX_BLUNDERS * len(seen):
         used = list(range(len(seen)))
