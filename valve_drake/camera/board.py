@@ -16,10 +16,11 @@ _DONE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
 _QUICK = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 # The sector-based search finds boards whose outer squares are cut off, or with things in front of their rim.
 _THOROUGH = (cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_CB_EXHAUSTIVE, 0)
-# Longer sides [px] to which an image is reduced for the search. At the first one every search takes some 0.3 s, also
-# in pure noise, where at full size it takes minutes; the others find boards that are small in the image.
-_SEARCHED = (1300, 2600)
-_TILE = 1600  # side of the overlapping parts in which a larger image is searched last [px]
+# Longer sides [px] to which an image is reduced for the search; the second one finds boards that are small in it.
+# A search of that size takes at most half a second, also in pure noise, where one at full size takes minutes and
+# cannot be interrupted.
+_SEARCHED = (1300, 2000)
+_TILE = 1300  # side of the overlapping parts in which a larger image is searched last [px]
 _OVERLAP = 400
 _MIN_PAIRS = 3  # by the names, if others have no partner: fewer are chance
 _WINDOW = 24  # largest half window of the sub-pixel search [px]
@@ -181,7 +182,7 @@ def _search(gray: np.ndarray, board: Board) -> np.ndarray | None:
         scale = min(side / longer, 1.0)
         first = side == _SEARCHED[0]
         reduced = gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        coarse = _found(reduced, board, quick=first, thorough=_THOROUGH if first else _THOROUGH[::2])
+        coarse = _found(reduced, board, quick=first, thorough=_THOROUGH if first else _THOROUGH[2:])
         coarse = None if coarse is None else _refined(coarse, reduced)
         if coarse is not None and scale < 1:
             # Pixel (0, 0) is the centre of the first pixel, also of the reduced image.
