@@ -213,6 +213,15 @@ def test_the_other_mount_is_refused(command, tmp_path):
     assert code == 2 and "leave out --eye-to-hand" in err and not (tmp_path / "hand.yaml").exists()
 
 
+def test_a_blunder_does_not_hide_the_mistake(command):
+    def change(poses: list[np.ndarray]) -> list[np.ndarray]:
+        bad = frames.make(poses[4][:, :3], poses[4][:, 3] + 0.1)
+        return [frames.inverse(X) for X in (*poses[:4], bad, *poses[5:])]
+
+    code, _, err = command(change)
+    assert code == 2 and "times better inverted:" in err
+
+
 def test_the_report_has_noise_covariance_and_the_published_methods(command, tmp_path):
     code, said, _ = command(lambda poses: poses, "--html", str(tmp_path / "hand.html"))
     assert code == 0 and said["warnings"] == []

@@ -29,6 +29,7 @@ MAX_SCATTER_DEG, MAX_SCATTER_MM = 3.0, 50.0  # of the arm: more is no arm, the p
 LARGE_SCATTER_DEG, LARGE_SCATTER_MM = 1.0, 10.0  # more than most arms: worth a warning
 _BETTER = 4.0  # times, so that a mistake explains the disagreement
 _FINE_DEG, _FINE_MM = 1.0, 10.0  # views that disagree by less are not suspected
+_REACH = 5.0  # positions that lie farther apart are no metres [m]
 _FEWEST = 4  # views with which a mistake is tried
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 
@@ -48,7 +49,7 @@ def refuse_mistakes(seen: Seen, poses: Poses) -> None:
     if size[0] > _FINE_DEG or size[1] > _FINE_MM:
         mistake = _better(seen, poses, size) or _exchanged(seen, poses)
         if mistake:
-            raise ConfigError(f"{_told(size)}, but {mistake}")
+            raise ConfigError(f"{_told(size)}, but fit {mistake}")
 
 
 def refuse_scatter(result: HandEye, seen: Seen, poses: Poses) -> None:
@@ -88,7 +89,8 @@ def _better(seen: Seen, poses: Poses, size: np.ndarray) -> str:
     for text, views in _hypotheses(seen, poses):
         if len(views) < max(_FEWEST, 0.7 * len(seen)):
             continue
-        for factor, unit in ((1.0, ""), (1e-3, "millimetres")):
+        reach = float(np.ptp(views.arm[:, :, 3], axis=0).max())
+        for factor, unit in ((1.0, ""), (1e-3, "millimetres"))[: 2 if reach > _REACH else 1]:
             arm = views.arm.copy()
             arm[:, :, 3] *= factor
             try:

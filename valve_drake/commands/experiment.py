@@ -1,4 +1,4 @@
-"""`valve-drake experiment`: the paper's tables, the bound and robustness, on drawn images."""
+"""`valve-drake experiment`: the paper's tables, the bound, robustness and the hand-eye calibration."""
 
 import argparse
 import importlib.util
@@ -13,7 +13,7 @@ from valve_drake.console import console as make_console
 
 
 def add(commands: Subcommands) -> None:
-    p = commands.add_parser("experiment", help="the paper's tables, the bound, robustness, on drawn images")
+    p = commands.add_parser("experiment", help="the paper's tables, the bound, robustness, hand-eye")
     p.add_argument("name", choices=("table2", "table3", "bound", "robustness", "hand-eye"))
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--trials", type=int, metavar="N", help="images a row (table2: runs of six poses)")
