@@ -173,6 +173,15 @@ def test_a_count_that_is_not_right_is_told_either_way(tmp_path, capsys):
     assert run(capsys, "recover", less, "-o", tmp_path / "c.mcap")[0] == 0
 
 
+def test_a_summary_that_lost_bytes_have_moved_still_counts(tmp_path):
+    data = own_log(tmp_path / "a.mcap").read_bytes()
+    start, end = chunks(data)[2]
+    (tmp_path / "b.mcap").write_bytes(data[: start + 50] + data[end - 50 :])
+    log = LogReader(tmp_path / "b.mcap")
+    assert log.lost_messages == 64 and "64 of 384 messages are missing" in log.losses
+    assert not any("summary" in line for line in log.damage)
+
+
 def test_definitions_that_only_the_summary_has_are_used(tmp_path):
     log = LogReader(Sample(MESSAGES, "zstd", summary=(SCHEMA, CHANNEL)).write(tmp_path / "a.mcap"))
     assert log.damage == [] and log.topics["example"].count == 10 and log.topics["example"].schema == "Example"

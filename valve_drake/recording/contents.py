@@ -356,12 +356,14 @@ class Contents:
     # ---- the summary, and definitions that the data lacks
 
     def _check_summary(self) -> bool:
-        """Whether the summary agrees with its CRC and lies where the footer says."""
+        """Whether the summary agrees with its CRC, wherever lost bytes have moved it; else it must be where it says."""
         if self._footer is None:
             return False
         start, stored = self._footer.summary_start, self._footer.summary_crc
         if start == 0:
             return not self._summary and self._statistics is None
+        if stored and self._data_end is not None:
+            return stored == crc(self._data, self._data_end, self._footer_crc_at)
         if not len(MAGIC) <= start <= self._footer_crc_at or self._data_end not in (None, start):
             return False
         return stored in (0, crc(self._data, start, self._footer_crc_at))
