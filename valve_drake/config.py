@@ -99,7 +99,10 @@ class Uniform:
     max: float = 0.0
 
 
-Number: typing.TypeAlias = float | Uniform
+if typing.TYPE_CHECKING:
+    Number: typing.TypeAlias = float  # as the blocks see it: resolved
+else:
+    Number = float | Uniform
 
 
 @dc.dataclass

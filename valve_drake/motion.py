@@ -1,6 +1,6 @@
 """Bounded motion in discrete time: the laws that all blocks with a commanded motion share, element by element."""
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,8 +13,9 @@ def braking_speed(distance: Numbers, acceleration: np.ndarray | float, dt: float
     Exact for steps of dt: n of them cover d = n v dt - n (n - 1) / 2 a dt^2, with the fewest n that end at rest.
     """
     unit = acceleration * dt
-    n = np.maximum(np.ceil((np.sqrt(1 + 8 * distance / (unit * dt)) - 1) / 2), 1.0)
-    return distance / (n * dt) + unit * (n - 1) / 2
+    n: Any = np.maximum(np.ceil((np.sqrt(1 + 8 * distance / (unit * dt)) - 1) / 2), 1.0)
+    speed: Numbers = distance / (n * dt) + unit * (n - 1) / 2
+    return speed
 
 
 def slew(value: Numbers, goal: Numbers, step: np.ndarray | float) -> Numbers:

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses as dc
 import gc
 from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import cv2
 from pydrake.lcm import DrakeLcm
@@ -31,7 +32,7 @@ class Rehearsed:
     pace: Pace | None
     dropped: Mapping[str, int]  # bad messages, by what they were for
 
-    def as_json(self) -> dict:
+    def as_json(self) -> dict[str, Any]:
         """The object of `twin --json`."""
         return {
             "sim_time_s": self.time,
@@ -104,7 +105,7 @@ def run_twin(
         if twin.dropped:
             notice(f"bad messages of the program were dropped: {listed(twin.dropped)}")
         end = float(twin.read("truth.valve_angle")[0])
-        return Rehearsed(twin.time, begin, end, pacer and pacer.report(twin.time), twin.dropped)
+        return Rehearsed(twin.time, begin, end, pacer.report(twin.time) if pacer else None, twin.dropped)
 
 
 def _tick(twin: Twin, pacer: Pacer) -> None:

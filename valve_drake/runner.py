@@ -218,7 +218,7 @@ def run(
     html = _write_recording(view, writer, troubles) if recording else None
     shares = {kind: seconds / wall for kind, seconds in profile.seconds.items()}
     shares["physics"] = 1.0 - sum(shares.values())
-    pace = pacer and pacer.report(mode.time)
+    pace = pacer.report(mode.time) if pacer else None
     summary = _summary(writer, mode, end)
     return Result(
         summary,

@@ -40,7 +40,7 @@ def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.
     marker = scenario.marker
     head = load_head(resources.find(scenario.head_calibration, resources.models()))
     mounts = make_mounts(head, simulation, scenario.seed)
-    rig = CameraRig(mounts, valve, tuple(marker.size), simulation.light, simulation.camera, scenario.seed)
+    rig = CameraRig(mounts, valve, (marker.size[0], marker.size[1]), simulation.light, simulation.camera, scenario.seed)
     X_WV = compose(panel_pose(valve), make(np.eye(3), np.array([0, 0, -marker.panel_depth])))
     base = start_pose(simulation.start, valve)
     X_BV = compose(inverse(planar(*base)), X_WV)

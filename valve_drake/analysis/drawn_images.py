@@ -59,7 +59,7 @@ class Canvas:
         self.image[:] = WALL
         self._xy, self._jacobian = _grid(lens)
 
-    def rectangle(self, X_CS: np.ndarray, color: tuple, half: tuple[float, float]) -> None:
+    def rectangle(self, X_CS: np.ndarray, color: tuple[float, ...], half: tuple[float, float]) -> None:
         """In the plane z = 0 of S, S in this camera, about its origin; half sizes [m]."""
         self._paint(color, self.coverage(X_CS, half))
 
@@ -106,7 +106,7 @@ class Canvas:
             n_u, n_v = (round(float(g.flat[near] / slope.flat[near]), 4) for g in (g_u, g_v))
             yield (xy @ line[:2] + line[2]) / slope, (n_u, n_v)
 
-    def disc(self, X_CS: np.ndarray, color: tuple, half: tuple[float, float]) -> None:
+    def disc(self, X_CS: np.ndarray, color: tuple[float, ...], half: tuple[float, float]) -> None:
         """An ellipse; its edge is nobody's measure, so the pixel's square counts as a little more blur."""
         P = frames.apply(X_CS, _UNIT * [*half, 0])
         box = self._box(P)
@@ -129,7 +129,7 @@ class Canvas:
         self.image *= (1 - (1 - factor) / (1 + np.exp(-np.clip(4 * sign * d / soft, -50, 50))))[:, :, None]
 
     def finish(
-        self, rng: np.random.Generator | None, noise: float, light: tuple = (1.0, 1.0, 1.0), jpeg: int = 0
+        self, rng: np.random.Generator | None, noise: float, light: tuple[float, ...] = (1.0, 1.0, 1.0), jpeg: int = 0
     ) -> np.ndarray:
         """The light's colour, white noise [grey levels], rounding, and JPEG of this quality unless 0 -> uint8."""
         image = self.image * np.asarray(light)
@@ -152,7 +152,7 @@ class Canvas:
         u1, v1 = np.minimum(np.ceil(px.max(0) + reach) + 1, [self.lens.width, self.lens.height]).astype(int)
         return (slice(v0, v1), slice(u0, u1)) if u1 > u0 and v1 > v0 else None
 
-    def _paint(self, color: tuple, covered: tuple[np.ndarray, tuple[slice, slice]] | None) -> None:
+    def _paint(self, color: tuple[float, ...], covered: tuple[np.ndarray, tuple[slice, slice]] | None) -> None:
         if covered is not None:
             cover, box = covered
             part = self.image[box]

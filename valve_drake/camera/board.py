@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from glob import escape, glob, has_magic
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -152,7 +153,7 @@ def pair_images(left: Sequence[Path], right: Sequence[Path]) -> Pairs:
     return Pairs(list(zip(left, right)), [], by_order=True)
 
 
-def _varying_parts(left: Sequence[str], right: Sequence[str]) -> list[list[tuple]] | None:
+def _varying_parts(left: Sequence[str], right: Sequence[str]) -> list[list[tuple[Any, ...]]] | None:
     """The parts (texts, numbers) of each name that are not the same in all names of its side; None if not unique."""
     parts = [[natural(name) for name in names] for names in (left, right)]
     if len({len(one) for side in parts for one in side}) != 1:

@@ -11,7 +11,9 @@ from valve_drake import frames
 from valve_drake.checks import ConfigError
 
 
-def minimize(problem: Callable, state: Any, moved: Callable, steps: int = 200) -> tuple[Any, tuple]:
+def minimize(
+    problem: Callable[..., Any], state: Any, moved: Callable[..., Any], steps: int = 200
+) -> tuple[Any, tuple[Any, ...]]:
     """Levenberg-Marquardt from `state` until no step is expected to matter -> the best state, problem(state)."""
     at = problem(state)
     if not math.isfinite(at[0]):

@@ -10,7 +10,7 @@ The paper's eq. (1) leads from raw to ideal in closed form; `project`, its inver
 import dataclasses as dc
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import Any, Protocol, TypeAlias
 
 import cv2
@@ -28,8 +28,13 @@ _NEWTON_STEPS = 6  # quadratic: 1e-12 px after four steps for any lens that `che
 class LensModel(Protocol):
     """What the program needs of a lens, whatever its formula."""
 
-    width: int  # of the raw image [px]
-    height: int
+    @property
+    def width(self) -> int:
+        """Of the raw image [px]."""
+
+    @property
+    def height(self) -> int:
+        """Of the raw image [px]."""
 
     def normalize(self, px: np.ndarray) -> np.ndarray:
         """Raw px (..., 2) -> ideal xy (..., 2)."""
@@ -302,7 +307,7 @@ def lens_from(data: Any, key: str) -> LensModel:
     return lens
 
 
-def lens_to(lens: LensModel) -> dict[str, Any]:
+def lens_to(lens: Any) -> dict[str, Any]:
     """The lens's fields as plain numbers and lists."""
     values = {f.name: getattr(lens, f.name) for f in dc.fields(lens)}
     return {
@@ -312,7 +317,7 @@ def lens_to(lens: LensModel) -> dict[str, Any]:
     }
 
 
-def _require_keys(data: dict, names: set[str], key: str, optional: set[str] = frozenset()) -> None:
+def _require_keys(data: dict[str, Any], names: set[str], key: str, optional: Set[str] = frozenset()) -> None:
     missing, unknown = sorted(names - set(data)), sorted(shown(n)[1:-1] for n in set(data) - names - optional)
     if missing or unknown:
         parts = [f"lacks {', '.join(missing)}"] * bool(missing)

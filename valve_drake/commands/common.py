@@ -8,12 +8,18 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn, TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
 
 from valve_drake import outputs
 from valve_drake.checks import ConfigError, require
 from valve_drake.console import console as make_console
 from valve_drake.console import styled
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from valve_drake.analysis.metrics import Summary
+    from valve_drake.runner import Progress
 
 OK, FAILED, BAD_INPUT, DAMAGED = 0, 1, 2, 3  # exit codes
 ECHO = 0.3  # a signal again within this time is the same one: a closing terminal and `timeout` send theirs twice [s]
@@ -123,7 +129,7 @@ def stopper() -> Iterator[Callable[[], bool]]:
 
 
 @contextlib.contextmanager
-def display(wanted: bool) -> Iterator[Callable]:
+def display(wanted: bool) -> Iterator[Callable[["Progress"], None]]:
     """A line that shows mode, simulated time and real-time factor, on a terminal only."""
     console = make_console(stderr=True)
     if not wanted or not console.is_terminal:
@@ -132,7 +138,7 @@ def display(wanted: bool) -> Iterator[Callable]:
     with console.status("starting") as status:
         last = [""]
 
-        def show(progress: object) -> None:
+        def show(progress: "Progress") -> None:
             mode = progress.mode
             factor = progress.sim_time / max(progress.wall_time, 1e-9)
             times = f"  {progress.sim_time:6.2f} s  x{factor:.2f} real time"
@@ -144,7 +150,7 @@ def display(wanted: bool) -> Iterator[Callable]:
         yield show
 
 
-def print_summary(console: object, s: object) -> None:
+def print_summary(console: "Console", s: "Summary") -> None:
     """What happened in a run: a line for each mode, the verdict, angles and forces."""
     from rich.table import Table
 

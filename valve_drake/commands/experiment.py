@@ -5,6 +5,7 @@ import importlib.util
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 from valve_drake import outputs
 from valve_drake.checks import ConfigError, require
@@ -54,7 +55,7 @@ def _made_before(path: Path) -> bool:
         return False
 
 
-def _print_experiment(result: dict) -> None:
+def _print_experiment(result: dict[str, Any]) -> None:
     from rich.table import Table
 
     def shown(value: object) -> str:

@@ -4,11 +4,15 @@ import argparse
 import json
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from valve_drake.checks import ConfigError
 from valve_drake.commands.common import DAMAGED, FAILED, OK, Subcommands, check_log, display
 from valve_drake.console import complain, styled
 from valve_drake.console import console as make_console
+
+if TYPE_CHECKING:
+    from valve_drake import runner
 
 
 def add(commands: Subcommands) -> None:
@@ -50,7 +54,7 @@ def command(options: argparse.Namespace) -> int:
     return OK if result.comparison.identical or options.set else FAILED
 
 
-def _print_replay(result: object) -> None:
+def _print_replay(result: "runner.Replay") -> None:
     from rich.table import Table
 
     console, found = make_console(), result.comparison
@@ -65,7 +69,7 @@ def _print_replay(result: object) -> None:
     if found.identical:
         console.print(styled(("identical", "bold green"), " to the recorded ones, to the bit"))
     else:
-        parting = f" from t = {found.first.time:.4f} s: {found.first}"
+        parting = f" from t = {found.first.time:.4f} s: {found.first}" if found.first else ""
         console.print(styled(("different", "bold red"), parting))
         columns = ("topic", "recorded", "replayed", "equal", "first [s]", "largest difference")
         table = Table(*columns, box=None, header_style="dim")
@@ -73,7 +77,7 @@ def _print_replay(result: object) -> None:
             if not topic.identical:
                 counts = (str(n) for n in (topic.recorded, topic.replayed, topic.equal))
                 largest = f"{topic.max_difference:.3g} {topic.largest.field}" if topic.largest else ""
-                table.add_row(name, *counts, f"{topic.first.time:.3f}", largest)
+                table.add_row(name, *counts, f"{topic.first.time:.3f}" if topic.first else "", largest)
         console.print(table)
     if result.log is not None and not result.log_error:
         console.print(f"log {result.log}")

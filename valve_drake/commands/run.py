@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from valve_drake import outputs
 from valve_drake.checks import OperationFailed, require_in
@@ -21,6 +22,10 @@ from valve_drake.commands.common import (
     stopper,
 )
 from valve_drake.console import complain, console, say
+
+if TYPE_CHECKING:
+    from valve_drake import runner
+    from valve_drake.recording.recorder_system import Sink
 
 
 def add(commands: Subcommands) -> None:
@@ -99,7 +104,7 @@ def command(options: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def _live(options: argparse.Namespace) -> Iterator[object | None]:
+def _live(options: argparse.Namespace) -> Iterator["Sink | None"]:
     """The live view, if it is asked for."""
     if not options.live:
         yield None
@@ -111,7 +116,7 @@ def _live(options: argparse.Namespace) -> Iterator[object | None]:
         yield view
 
 
-def _print_result(result: object) -> None:
+def _print_result(result: "runner.Result") -> None:
     s = result.summary
     print_summary(console(), s)
     factor = s.sim_time_s / max(result.wall_time, 1e-9)

@@ -68,7 +68,7 @@ class ColorSegmentationSystem(Block[ColorSegmentationInputs, _Memory]):
             seen.append(one)
             boxes.append(box)
         pair = SegmentationPair(time=left.time, sequence=left.sequence, left=seen[0], right=seen[1])
-        memory = _Memory(idle=0, sequence=left.sequence, looks=memory.looks + 1, boxes=tuple(boxes))
+        memory = _Memory(idle=0, sequence=left.sequence, looks=memory.looks + 1, boxes=(boxes[0], boxes[1]))
         return memory, {"segmentation": pair}
 
     def _look(self, frame: CameraFrame, box: _Box | None) -> tuple[Segmentation, _Box | None]:

@@ -19,7 +19,8 @@ from valve_drake.perception.color_segmentation import (
     polygon_area,
     quadrilateral,
 )
-from valve_drake.perception.line_fitting import SidesConfig, fit_quads, meet, side_lines
+from valve_drake.perception.joint_fit import meet
+from valve_drake.perception.line_fitting import SidesConfig, fit_quads, side_lines
 from valve_drake.perception.marker import NEXT
 
 

@@ -305,9 +305,9 @@ def _corner_pixels(
     r = value - (place * light[:, :3]).sum(1) - height * cover
     chi2 = r * r / variance[q]
     good = chi2 < _CUT**2
-    n = np.bincount(row, good, C)
-    mean = np.bincount(row, good * chi2, C) / np.maximum(n, 1)
-    good &= ((mean < _POOR) & (n > 0.9 * np.bincount(row, minlength=C)))[row]
+    used = np.bincount(row, good, C)
+    mean = np.bincount(row, good * chi2, C) / np.maximum(used, 1)
+    good &= ((mean < _POOR) & (used > 0.9 * np.bincount(row, minlength=C)))[row]
     return J[good], r[good], q[good]
 
 

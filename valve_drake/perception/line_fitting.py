@@ -16,6 +16,7 @@
 
 import dataclasses as dc
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -121,15 +122,15 @@ def fit_pair(
     for k, candidate, one in zip(used, candidates, raw):
         seen, lens = cameras[k]
         quads[k] = _edges_of(one, candidate, seen.green, lens, config.max_sigma)
-    quads = [quad or QuadEdges(reason=why_none) for quad in quads]
+    left, right = (quad or QuadEdges(reason=why_none) for quad in quads)
     reason = ""
-    if quads[0].found and quads[1].found:
-        reason = wrong_size(quads[0].corners, quads[1].corners, head, marker, matching)
+    if left.found and right.found:
+        reason = wrong_size(left.corners, right.corners, head, marker, matching)
     elif len(used) == 2 and not config.single_camera:  # one camera alone takes many things for the marker
-        reason = quads[0].reason or quads[1].reason
+        reason = left.reason or right.reason
     if reason:
-        quads = [quad if quad.reason else QuadEdges(reason=reason, center_px=quad.center_px) for quad in quads]
-    return MarkerEdges(time=pair.time, sequence=pair.sequence, left=quads[0], right=quads[1])
+        left, right = (q if q.reason else QuadEdges(reason=reason, center_px=q.center_px) for q in (left, right))
+    return MarkerEdges(time=pair.time, sequence=pair.sequence, left=left, right=right)
 
 
 def _edges_of(
@@ -517,7 +518,7 @@ def _follow(sheet: Sheet, sides: _Sides, config: SidesConfig) -> _Followed:
     lines = start[:, None] + slope[:, None] * all_t
     all_powers = basis(all_tau)
 
-    def profiles(stride: int) -> tuple:
+    def profiles(stride: int) -> tuple[Any, ...]:
         """Every stride-th one of each side, about what is known of it so far: all that the fit needs of them."""
         some = np.s_[:, ::stride]
         line, powers = lines[some], all_powers[:, :, ::stride]

@@ -67,12 +67,12 @@ def _axes(canvas: np.ndarray, X_CV: np.ndarray, lens: LensModel, origin: np.ndar
         _text(canvas, name, tip, color, scale)
 
 
-def _polygon(canvas: np.ndarray, corners: np.ndarray, color: tuple, scale: int) -> None:
+def _polygon(canvas: np.ndarray, corners: np.ndarray, color: tuple[int, ...], scale: int) -> None:
     points = np.array([_at(corner, scale) for corner in corners], np.int32)
     cv2.polylines(canvas, [points], True, color, 1, cv2.LINE_AA, _SUB)
 
 
-def _text(canvas: np.ndarray, text: str, at: np.ndarray, color: tuple, scale: int) -> None:
+def _text(canvas: np.ndarray, text: str, at: np.ndarray, color: tuple[int, ...], scale: int) -> None:
     x, y = (np.asarray(at) * scale).round().astype(int)
     width = cv2.getTextSize(text, _FONT, 0.45, 1)[0][0]
     x = int(np.clip(x + 3, 0, max(canvas.shape[1] - width - 3, 0)))

@@ -30,8 +30,8 @@ from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require
 from valve_drake.config import Config, choice, number
 from valve_drake.messages import MarkerEdges, QuadEdges, RectangleEstimate
-from valve_drake.perception.joint_fit import NODES
-from valve_drake.perception.line_fitting import meet, side_lines
+from valve_drake.perception.joint_fit import NODES, meet
+from valve_drake.perception.line_fitting import side_lines
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.stereo_positioning import epipolar_offset, turn_between
 

@@ -143,16 +143,18 @@ def triangulate(
     focal = [head.left.focal(), head.right.focal()]
     p = _mid_points(xy[0][None], xy[1][None], head)[0][0]
     for _ in range(3):
-        r, J, yaw = [], [], []
+        rows: list[np.ndarray] = []
+        slopes: list[np.ndarray] = []
+        turns: list[np.ndarray] = []
         for X, seen, f in ((frames.make(np.eye(3), np.zeros(3)), xy[0], focal[0]), (X_RL, xy[1], focal[1])):
             q = X[:, :3] @ p + X[:, 3]
             if not q[2] > 1e-6:
                 return np.full(3, np.nan), np.full((3, 3), np.inf), math.inf
             P = np.array([[1, 0, -q[0] / q[2]], [0, 1, -q[1] / q[2]]]) / q[2] * f
-            r.append((q[:2] / q[2] - seen) * f)
-            J.append(P @ X[:, :3])
-            yaw.append(P @ np.array([-q[2], 0, q[0]]) if X is X_RL else np.zeros(2))
-        r, J, yaw = np.concatenate(r), np.concatenate(J), np.concatenate(yaw)
+            rows.append((q[:2] / q[2] - seen) * f)
+            slopes.append(P @ X[:, :3])
+            turns.append(P @ np.array([-q[2], 0, q[0]]) if X is X_RL else np.zeros(2))
+        r, J, yaw = np.concatenate(rows), np.concatenate(slopes), np.concatenate(turns)
         N = np.linalg.inv(J.T @ J)
         p = p - N @ (J.T @ r)
     by_yaw = N @ (J.T @ yaw) * yaw_sigma

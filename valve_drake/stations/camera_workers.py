@@ -34,7 +34,7 @@ KEPT = 8  # captures of a camera that may still be asked for
 
 @dc.dataclass
 class _Worker:
-    process: subprocess.Popen
+    process: subprocess.Popen[bytes]
     wire: multiprocessing.connection.Connection
 
 
@@ -43,7 +43,7 @@ class CameraWorkers:
 
     def __init__(self) -> None:
         self._workers: list[_Worker] = []
-        self._captures = {name: collections.deque(maxlen=KEPT) for name in CAMERAS}
+        self._captures: dict[str, collections.deque[Any]] = {name: collections.deque(maxlen=KEPT) for name in CAMERAS}
         self._asked: dict[str, dict[int, Capture]] = {name: {} for name in CAMERAS}
         self._made: dict[tuple[str, int], CameraFrame] = {}
         self._read: dict[str, tuple[int, int]] = {}  # sequence read last, and how many captures after the one before

@@ -8,7 +8,8 @@ import dataclasses as dc
 
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, PortDataType
 
-from valve_drake.messages import CAMERAS, SIDES, CameraFrame, Health
+from valve_drake.messages import CAMERAS as CAMERAS
+from valve_drake.messages import SIDES, CameraFrame, Health
 
 HEAD, WRISTS = CAMERAS[:2], CAMERAS[2:]
 MATE = {HEAD[0]: HEAD[1], HEAD[1]: HEAD[0], WRISTS[0]: WRISTS[1], WRISTS[1]: WRISTS[0]}  # the other one of a pair

@@ -101,7 +101,7 @@ class Snapshot:
     images: dict[str, _Image | None]
     health: Health
 
-    def __deepcopy__(self, memo: dict) -> "Snapshot":
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Snapshot":
         return self
 
 
@@ -475,7 +475,12 @@ def _sound(values: Values | Mapping[str, float] | None) -> bool:
 def _frozen(key: str, values: Values | None, last: Values | None) -> bool:
     """Says what it said last, though it is never still or says that it moves."""
     row = CHANNELS[key]
-    if values is None or row.read is None or any(not np.array_equal(values[port], last[port]) for port in values):
+    if (
+        values is None
+        or last is None
+        or row.read is None
+        or any(not np.array_equal(values[port], last[port]) for port in values)
+    ):
         return False
     speeds = [v[3:] if port == "base.odometry" else v for port, v in values.items() if port in SPEEDS]
     return key in NEVER_STILL or any(np.max(np.abs(speed)) > MOVING for speed in speeds)

@@ -74,6 +74,8 @@ class Channel:
         return "VALVE_" + self.key.replace(".", "_").upper()
 
     def encode(self, utime: int, values: Values) -> Any:
+        if self.write is None:
+            raise TypeError(f"{self.key}: its sender makes the message")
         message = self.write(values)
         setattr(message, self.stamp, utime)
         return message
@@ -84,7 +86,7 @@ def _count(wanted: int, found: int, what: str) -> None:
         raise WrongMessage(f"{found} {what}, want {wanted}")
 
 
-def _signal(port: str, coordinates: tuple[str, ...]) -> tuple[Callable, Callable]:
+def _signal(port: str, coordinates: tuple[str, ...]) -> tuple[Callable[..., Any], Callable[..., Any]]:
     def write(values: Values) -> lcmt_drake_signal:
         return signal(dict(zip(coordinates, values[port].tolist())))
 
@@ -102,7 +104,7 @@ def signal(values: Mapping[str, float]) -> lcmt_drake_signal:
     return message
 
 
-def _joint_command(port: str, n: int) -> tuple[Callable, Callable]:
+def _joint_command(port: str, n: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     def write(values: Values) -> lcmt_iiwa_command:
         message = lcmt_iiwa_command()
         message.num_joints, message.joint_position = n, values[port].tolist()
@@ -115,7 +117,9 @@ def _joint_command(port: str, n: int) -> tuple[Callable, Callable]:
     return write, read
 
 
-def _joint_status(position: str, n: int, velocity: str = "", torque: str = "") -> tuple[Callable, Callable]:
+def _joint_status(
+    position: str, n: int, velocity: str = "", torque: str = ""
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
     def write(values: Values) -> lcmt_iiwa_status:
         zeros = [0.0] * n
         message = lcmt_iiwa_status()
@@ -137,7 +141,9 @@ def _joint_status(position: str, n: int, velocity: str = "", torque: str = "") -
     return write, read
 
 
-def _gripper(kind: type, position: str, force: str, fields: tuple[str, str]) -> tuple[Callable, Callable]:
+def _gripper(
+    kind: type, position: str, force: str, fields: tuple[str, str]
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
     opening, newton = fields
 
     def write(values: Values) -> Any:
@@ -152,7 +158,7 @@ def _gripper(kind: type, position: str, force: str, fields: tuple[str, str]) -> 
     return write, read
 
 
-def _wrench(port: str) -> tuple[Callable, Callable]:
+def _wrench(port: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
     def write(values: Values) -> lcmt_force_torque:
         message = lcmt_force_torque()
         message.tx, message.ty, message.tz, message.fx, message.fy, message.fz = values[port].tolist()
