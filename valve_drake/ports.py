@@ -44,7 +44,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem, State
 from valve_drake.messages import Message
 
 TICK = 1 / 128  # control period [s]
-SLOT = 1 / 512  # plant period, and the slots of a tick [s]
+SLOT = 1 / 512  # the slots of a tick [s]
 
 # Of a port: a message class, the size of a vector, or a model value of one of Drake's types.
 Kind: TypeAlias = type | int | AbstractValue

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.controllers import InverseDynamics
@@ -30,6 +30,7 @@ from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
 
 TORSO = ("waist", "neck_pitch", "neck_yaw")
 BASE = ("base_x", "base_y", "base_yaw")
+STEP = 2 * SLOT  # of the plant; half of it gives the same forces and angles for twice the work [s]
 FINGER_STIFFNESS = 2e4  # of the finger servo, as in the model file [N/m]
 
 
@@ -369,7 +370,7 @@ def make_simulated_station(
     """
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
-        time_step=SLOT, discrete_contact_approximation="lagged", contact_model="point", stiction_tolerance=1e-4
+        time_step=STEP, discrete_contact_approximation="lagged", contact_model="point", stiction_tolerance=1e-4
     )
     plant, scene_graph = AddMultibodyPlant(config, builder)
     plant.set_name("plant")
@@ -377,6 +378,8 @@ def make_simulated_station(
     valve = simulation.valve
     scene = add_scene(plant, valve, marker_size)
     plant.Finalize()
+    if meshcat is None:
+        _leave_out_looks(plant, scene_graph)
     start = start_pose(simulation.start, valve)
     offsets = arm_offsets(simulation.error, seed)
     arms = home - np.concatenate([offsets[side] for side in SIDES])  # home is what the encoders read
@@ -388,7 +391,7 @@ def make_simulated_station(
     still.set_name("valve_at_rest")
     builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(scene.valve))
 
-    model = MultibodyPlant(SLOT)
+    model = MultibodyPlant(STEP)
     parse(model, "robot")
     model.Finalize()
     gravity = builder.AddSystem(InverseDynamics(model, InverseDynamics.InverseDynamicsMode.kGravityCompensation))
@@ -460,6 +463,16 @@ def make_simulated_station(
     station.set_name("simulated")
     check_contract(station)
     return station
+
+
+def _leave_out_looks(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Removes what only looks: physics would carry it along at every step, and the cameras have their own scene."""
+    inspector = scene_graph.model_inspector()
+    source = plant.get_source_id()
+    assert source is not None
+    for id in inspector.GetAllGeometryIds():
+        if inspector.GetProximityProperties(id) is None and inspector.BelongsToSource(id, source):
+            scene_graph.RemoveGeometry(source, id)
 
 
 def _set_start(
