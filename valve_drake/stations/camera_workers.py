@@ -1,8 +1,8 @@
 """Images made beside the run: a process for the left eye of each pair and one for the right.
 
-Rendering is the dearest work of a run after the contact physics, and an image needs nothing but the positions at its
-capture. So it is begun when it is captured, if it will be looked at, and is fetched when it is: the same bits as
-`CameraRig.frame`, sooner. What is foreseen wrongly costs time and changes nothing.
+After the contact physics, rendering costs most of a run's time, and an image depends only on the positions at its
+capture. So its rendering begins at the capture if a block will probably look at it, and the image is fetched when one
+does: the same bits as `CameraRig.frame`, sooner. A wrong guess costs time and changes no result.
 """
 
 import collections
@@ -84,7 +84,7 @@ class CameraWorkers:
     def frame(self, name: str, capture: Capture) -> CameraFrame:
         """The image of a capture. Raises OperationFailed if the process that makes it has ended."""
         self._ask(name, capture)
-        mate = MATE[name]  # who reads one eye reads the other next
+        mate = MATE[name]  # a block that reads one eye reads the other next
         for other in self._captures[mate]:
             if (other.sequence, other.time) == (capture.sequence, capture.time):
                 self._ask(mate, other)

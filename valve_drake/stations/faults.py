@@ -2,11 +2,11 @@
 
 | kind      | what it does to `device` ("" is every device)                                            | numbers       |
 |-----------|------------------------------------------------------------------------------------------|---------------|
-| latency   | its messages, commands and reports, take `delay` longer, give or take `jitter`           | delay, jitter |
+| latency   | its messages, commands and reports, take `delay` +- `jitter` longer                      | delay, jitter |
 | loss      | this share of its messages is lost                                                       | share         |
 | duplicate | this share of its messages comes twice                                                   | share         |
 | reorder   | this share of its messages is overtaken by the next one                                  | share         |
-| frozen    | its reports and images go on saying what they said                                       |               |
+| frozen    | its reports and images repeat the last ones                                              |               |
 | nan       | its reports are not numbers                                                              |               |
 | dead      | it reports nothing, takes no commands: a camera without images, a driver that crashed    |               |
 | restart   | as dead, and then its clock begins anew; needs a `duration`                              | duration      |
@@ -14,7 +14,7 @@
 | estop     | the emergency stop of the whole robot is pressed                                         |               |
 
 A fault begins `start` seconds after the run's beginning, or after `mode` was first entered, and lasts `duration`
-(0: to the end). What chance decides is drawn from the seed.
+(0: to the end). Random choices are drawn from the seed.
 """
 
 import dataclasses as dc
@@ -70,7 +70,7 @@ class Faults:
             for k, f in enumerate(self._faults)
         ]
         self._entered: dict[str, float] = {"": 0.0}
-        self._kept: dict[str, Any] = {}  # what a frozen device said last, and where a stuck joint stands
+        self._kept: dict[str, Any] = {}  # a frozen device's last report, and a stuck joint's position
 
     def enter(self, mode: str, time: float) -> None:
         """The program has entered a mode."""
@@ -99,7 +99,7 @@ class Faults:
         return time - max((end for end in ends if end <= time), default=0.0)
 
     def frozen(self, key: str, time: float, now: Any) -> Any:
-        """`now`, or what was said when it froze."""
+        """The report `now`, or the one at which the device froze."""
         if self.acts("frozen", CHANNELS[key].device, time):
             return self._kept.setdefault(key, now)
         self._kept.pop(key, None)

@@ -2,7 +2,7 @@
 
 `RobotLink` keeps what the robot reported last, as a socket does, outside the Context; two blocks stand between it and
 the ports. `lcm_receiver` reads it in slot 3, just before the next tick; `lcm_sender` publishes the commands of a tick
-at its end. A station is alive when it is initialised: it waits there for every device's first report.
+at its end. When the station is initialised, it waits for every device's first report.
 
 A report is news only if its stamp is later than that of the last one. Sensors with noise (wrists, cameras), and any
 device that reports a speed, must also say something else than last time. Duplicates, overtaken messages and frozen
@@ -160,7 +160,7 @@ class RobotLink:
         self._delay = LeastDelay()
         self._lockstep = Lockstep()
         self._requests = CameraRequests()
-        self._films: dict[str, collections.deque[_Image]] = {c: collections.deque(maxlen=4) for c in CAMERAS}
+        self._images: dict[str, collections.deque[_Image]] = {c: collections.deque(maxlen=4) for c in CAMERAS}
         self._placed: dict[int, float] = {}  # utime of a capture -> time on this side
         self._time = 0.0  # of the tick that looks at what arrives now [s of the diagram]
         self._answered = -1  # the last tick whose commands were sent
@@ -216,7 +216,7 @@ class RobotLink:
             self._bad.bad(row.device, f"{row.device}: not finite", arrival, at_once=True)
             if last is None or key not in NEVER_STILL:
                 return
-            arrival = last.arrival  # shown all the same: what is not known must not look known
+            arrival = last.arrival  # the port shows NaN all the same: an unknown force must not look known
         else:
             self._bad.good(row.device, arrival)
             if last is not None and _frozen(key, values, last.values):
@@ -229,8 +229,8 @@ class RobotLink:
         utime, data, now = image.header.utime, bytes(image.data), self.clock()
         if not self._is_news(key, utime):
             return
-        film, last = self._films[camera], self._reports.get(key)
-        if film and film[-1].data == data:  # a frozen camera has nothing to say
+        kept, last = self._images[camera], self._reports.get(key)
+        if kept and kept[-1].data == data:  # a frozen camera has nothing to say
             return
         least = self._delay.least()
         if least is None:  # the robot's clock is not known
@@ -248,7 +248,7 @@ class RobotLink:
             raise WrongMessage(f"an image stamped {time - self._time:.1f} s ahead of the robot's other reports")
         before = -math.inf if last is None else last.arrival
         self._reports[key] = _Report(now, None)
-        film.append(_Image(utime, image.header.seq, data, time, before))
+        kept.append(_Image(utime, image.header.seq, data, time, before))
 
     def _wait(self) -> None:
         if not self.bus.pump():
@@ -382,11 +382,11 @@ class RobotLink:
 
     def _shown(self, time: float) -> dict[str, _Image | None]:
         """The newest image of each camera; of the head's eyes the newest that both have."""
-        shown = {camera: film[-1] if film else None for camera, film in self._films.items()}
-        both = {i.utime for i in self._films[HEAD[0]]} & {i.utime for i in self._films[HEAD[1]]}
+        shown = {camera: kept[-1] if kept else None for camera, kept in self._images.items()}
+        both = {i.utime for i in self._images[HEAD[0]]} & {i.utime for i in self._images[HEAD[1]]}
         if both:
             newest = max(both)
-            shown |= {eye: next(i for i in self._films[eye] if i.utime == newest) for eye in HEAD}
+            shown |= {eye: next(i for i in self._images[eye] if i.utime == newest) for eye in HEAD}
         elif all(shown[eye] for eye in HEAD):
             shown |= dict.fromkeys(HEAD)
         return {c: i if i is not None and time - i.time <= self._config.image_age else None for c, i in shown.items()}
@@ -410,14 +410,14 @@ class RobotLink:
                 raise ValueError("an image of another size than its header says")
         except ValueError as error:
             self._bad.bad(camera, f"{camera}: {error}", self.clock())
-            film, report = self._films[camera], self._reports[IMAGES[camera].key]
-            if film and film[-1].utime == image.utime:
+            kept, report = self._images[camera], self._reports[IMAGES[camera].key]
+            if kept and kept[-1].utime == image.utime:
                 report.arrival = image.before
-            for later in film:
+            for later in kept:
                 later.before = image.before if later.utime > image.utime else later.before
-            kept = [other for other in film if other.utime != image.utime]
-            film.clear()
-            film.extend(kept)
+            sound = [other for other in kept if other.utime != image.utime]
+            kept.clear()
+            kept.extend(sound)
             return CameraFrame(camera=camera)
         self._bad.good(camera, self.clock())
         return CameraFrame(camera, image.time, image.sequence, pixels, image.data)
@@ -442,9 +442,9 @@ class RobotLink:
         """Listens while there is nothing else to do, since a channel has room for one message; decodes images ahead."""
         wall.sleep(min(seconds, 2e-3))
         self.bus.pump()
-        fresh = (c for c in self._requests.since if self._films[c] and self._films[c][-1].frame is None)
+        fresh = (c for c in self._requests.since if self._images[c] and self._images[c][-1].frame is None)
         if seconds > DECODING and (camera := next(fresh, None)):
-            self._decoded(camera, self._films[camera][-1])
+            self._decoded(camera, self._images[camera][-1])
 
     def tell(self, mode: str, activation: int) -> None:
         """Tells the robot's side what the program is doing, with the next commands."""
@@ -473,7 +473,7 @@ def _sound(values: Values | Mapping[str, float] | None) -> bool:
 
 
 def _frozen(key: str, values: Values | None, last: Values | None) -> bool:
-    """Says what it said last, though it is never still or says that it moves."""
+    """The same values again, from a sensor with noise or a device that reports a speed."""
     row = CHANNELS[key]
     if (
         values is None
