@@ -15,7 +15,7 @@ from valve_drake import frames
 from valve_drake.camera import calibration as cal
 from valve_drake.camera.board import Board, find_corners, find_images, natural, pair_images, parse_board
 from valve_drake.camera.calibration_file import load_calibration, save_camera
-from valve_drake.camera.lens import Lens, OpenCvLens, StereoHead, load_head, save_head
+from valve_drake.camera.lens import KNOWN, Lens, OpenCvLens, StereoHead, load_head, save_head
 from valve_drake.checks import ConfigError
 from valve_drake.cli import main
 from valve_drake.messages import MarkerEdges, QuadEdges
@@ -301,7 +301,7 @@ def test_terms_that_the_corners_do_not_determine_are_not_fitted_and_the_lens_is_
     assert np.abs(deviations(result.fit, (true,))).max() < 4
     lens, corners = result.fit.lenses[0], np.array([[0.0, 0.0], [639, 0], [0, 479], [639, 479]])
     inside, outside = lens.sigma(np.array([[320.0, 240.0], [380, 200]])), lens.sigma(corners)
-    assert inside.max() < 0.3 < cal.KNOWN < 3 < outside.min() and 0.2 < result.unknown[0] < 0.9
+    assert inside.max() < 0.3 < KNOWN < 3 < outside.min() and 0.2 < result.unknown[0] < 0.9
     # The map says how far off the lens is, up to a turn of the camera.
     off = true.project(lens.normalize(corners)) - corners
     middle = np.array([[300.0, 220], [340, 260], [340, 220], [300, 260]])

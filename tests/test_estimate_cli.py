@@ -1,5 +1,6 @@
 """valve-drake estimate: from photographs to a pose, or one clear line."""
 
+import dataclasses as dc
 import json
 import pathlib
 import re
@@ -187,6 +188,24 @@ def test_bad_input_is_one_clear_line(photos, capsys, monkeypatch, arguments, say
     rest += [] if "--calibration" in arguments else ["--calibration", CALIBRATION]
     code, said, err = run(capsys, *arguments, *rest)
     assert code == 2 and says in err and err.count("\n") == 1 and not said["text"].strip()
+
+
+def test_where_the_lens_is_not_known_the_covariance_holds_what_it_may_be(photos, tmp_path, capsys):
+    unknown, silent = dc.replace(HEAD.left, sigma_px=[[3.0, 3.0], [3.0, 3.0]]), HEAD.left
+    said = {}
+    for name, lens in (("unknown", unknown), ("silent", silent)):
+        save_camera(lens, tmp_path / f"{name}.yaml")
+        code, said[name], _ = run(capsys, photos / "left.png", *given(tmp_path / f"{name}.yaml"), "--json")
+        assert code == 0
+    wide, narrow = (np.array(said[name]["covariance"]) for name in ("unknown", "silent"))
+    assert (np.linalg.eigvalsh(wide - narrow) > 0).all() and np.linalg.eigvalsh(wide).min() > 0
+    # 3 px of a corner are 2.1 px in each direction; the mean of four that share half the variance has 1.7 px.
+    assert np.sqrt(wide[3, 3]) == pytest.approx(1.7 / 1082 * 1.1, rel=0.15) and said["unknown"][
+        "lens_sigma_px"
+    ] == pytest.approx(3.0)
+    assert said["silent"]["lens_sigma_px"] == 0.0
+    code, text, _ = run(capsys, photos / "left.png", *given(tmp_path / "unknown.yaml"))
+    assert "knows the lens here to 3.0 px only" in text["text"]
 
 
 def test_a_head_that_is_off_its_calibration_is_put_right_by_the_known_size(photos):

@@ -27,7 +27,7 @@ import numpy as np
 from valve_drake import frames
 from valve_drake.camera.board import Board
 from valve_drake.camera.least_squares import divided, minimize, skew, stepped, transform
-from valve_drake.camera.lens import Lens, LensModel, OpenCvLens, StereoHead
+from valve_drake.camera.lens import KNOWN, Lens, LensModel, OpenCvLens, StereoHead
 from valve_drake.checks import ConfigError
 
 KINDS = ("opencv", "paper")
@@ -44,7 +44,6 @@ _TERMS = ((0, 1, 2, 3, 4), (0, 1, 2, 3), (0, 2, 3), (2, 3), (0, 1, 4), (0, 1), (
 _FRONTAL_TERMS = ((0,), ())
 _POWER = (2, 4, 1, 1, 6)  # of the radius, by which each acts
 _PRIOR = (0.2, 0.1, 2e-3, 2e-3, 0.05)  # what each may change at the image's corner, relative to the radius
-KNOWN = 1.0  # standard deviation of a pixel up to which the lens counts as known there [px]
 _MAP = (7, 9)  # rows and columns of the map of standard deviations
 _POOR = 0.2  # rms of a camera's corners beyond which a fisheye's model is tried [px]
 _FISHEYE = 0.6  # of a pinhole's rms, below which a fisheye's says that it is one

@@ -17,7 +17,7 @@ from valve_drake.camera import calibration_page as pages
 from valve_drake.camera.board import Board, Pairs, find_corners, find_images, pair_images
 from valve_drake.camera.calibration_file import save_camera
 from valve_drake.camera.image_file import read_image
-from valve_drake.camera.lens import save_head
+from valve_drake.camera.lens import KNOWN, save_head
 from valve_drake.checks import ConfigError, require
 from valve_drake.console import console
 
@@ -201,7 +201,7 @@ def _report(command: str, result: cal.Calibration, pictures: Pictures, board: Bo
         warnings.append(f"the boards cover {100 * min(numbers['coverage']):.0f} % of the image only")
     if max(result.unknown) > 0:
         warnings.append(
-            f"the lens is known to worse than {cal.KNOWN:g} px in {100 * max(result.unknown):.0f} % of the image: "
+            f"the lens is known to worse than {KNOWN:g} px in {100 * max(result.unknown):.0f} % of the image: "
             "show the board there, or keep the marker where the boards were"
         )
     if pictures.missed():

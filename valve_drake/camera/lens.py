@@ -21,6 +21,7 @@ from valve_drake.checks import ConfigError, require, require_in, shown
 
 SigmaMap: TypeAlias = Sequence[Sequence[float]] | None  # rows from top to bottom, evenly over the image [px]
 
+KNOWN = 1.0  # standard deviation up to which a lens counts as known at a pixel [px]
 _MOST_PX = 1e6  # of a focal length, and of the principal point's distance from the image
 _NEWTON_STEPS = 6  # quadratic: 1e-12 px after four steps for any lens that `check` lets pass
 

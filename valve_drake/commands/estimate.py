@@ -137,6 +137,7 @@ def _pose(seen: "Look", sides: list[str]) -> dict[str, Any]:
         "ambiguity": found.ambiguity if found.found else None,
         "residual_px": found.residual_px if found.found else None,
         "epipolar_px": seen.epipolar_px if len(sides) == 2 and found.found else None,
+        "lens_sigma_px": seen.lens_px if found.found else None,
     }
 
 
@@ -153,6 +154,8 @@ def _as_json(seen: "Look", others: "list[Look]", sides: list[str], method: str, 
 
 
 def _as_text(seen: "Look", others: "list[Look]", sides: list[str], method: str, time_ms: float) -> str:
+    from valve_drake.camera.lens import KNOWN
+
     found = seen.estimate
     if not found.found:
         lines = [f"not found: {found.reason}"]
@@ -163,6 +166,8 @@ def _as_text(seen: "Look", others: "list[Look]", sides: list[str], method: str, 
         return "\n".join(lines)
     lines = [f"found by {method} in the {sides[0]} camera's frame, {time_ms:.1f} ms", *_pose_lines(seen)]
     lines.append(f"residual  {found.residual_px:.2f} px, mirrored pose worse by chi2 {found.ambiguity:.1f}")
+    if seen.lens_px > KNOWN:
+        lines.append(f"the calibration knows the lens here to {seen.lens_px:.1f} px only: no board was there")
     if others:
         count = f"{len(others) + 1} red rectangles of this shape"
         lines.append(f"{count}: the one above fits best, but any of them may be the marker")

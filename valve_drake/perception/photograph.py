@@ -12,6 +12,7 @@ import dataclasses as dc
 
 import numpy as np
 
+from valve_drake import frames
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import ConfigError
 from valve_drake.messages import CameraFrame, QuadEdges, RectangleEstimate, Segmentation, SegmentationPair
@@ -35,6 +36,7 @@ class Look:
     edges: tuple[QuadEdges, ...]
     corners_px: tuple[np.ndarray | None, ...]  # (4, 2) for each camera, in one order, clockwise as seen [px]
     epipolar_px: float  # distance of the right centre from the left one's epipolar line
+    lens_px: float = 0.0  # standard deviation of the lens where the marker is, the largest of its corners
 
 
 @dc.dataclass(frozen=True)
@@ -105,7 +107,12 @@ class _Stages:
             elif len(corners) == 2 and corners[0] is not None and corners[1] is not None:
                 corners[1] = np.roll(corners[1], -turn_between(corners[0], corners[1]), axis=0)
         epipolar = float(np.linalg.norm(shift)) * head.right.focal()
-        return Look(estimate=found, seen=seen, edges=quads, corners_px=tuple(corners), epipolar_px=epipolar)
+        lens_px = 0.0
+        if found.found:
+            used = [camera for camera, px in enumerate(corners) if px is not None]
+            of_lens, lens_px = _covariance_of_lenses(found.X_LV, head, used, self.marker)
+            found = dc.replace(found, covariance=found.covariance + of_lens)
+        return Look(found, seen, quads, tuple(corners), epipolar, lens_px)
 
 
 def look(
@@ -147,6 +154,33 @@ def _without(seen: Segmentation, quad: QuadEdges) -> Segmentation:
             taken = dc.replace(candidate, rejected="seen as a marker already")
             return dc.replace(seen, candidates=(*seen.candidates[:k], *seen.candidates[k + 1 :], taken))
     return seen
+
+
+def _covariance_of_lenses(
+    X_LV: np.ndarray, head: StereoHead, used: list[int], marker: Marker
+) -> tuple[np.ndarray, float]:
+    """What the calibration of the lenses leaves open of a pose (6, 6), and their largest standard deviation [px].
+
+    Each corner may lie elsewhere by its lens's `sigma`; neighbours share half of that variance. Zero for lenses whose
+    calibration does not say. Order and units as in RectangleEstimate.covariance.
+    """
+
+    def corners(step: np.ndarray) -> np.ndarray:
+        P = marker.corners() @ (X_LV[:, :3] @ frames.rotation(step[:3])).T + X_LV[:, 3] + step[3:]
+        in_each = (P, (P - head.X_LR[:, 3]) @ head.X_LR[:, :3])
+        return np.array([head.lenses()[k].project(in_each[k][:, :2] / in_each[k][:, 2:]) for k in used])
+
+    px = corners(np.zeros(6))
+    sigma = np.array([head.lenses()[k].sigma(one) for k, one in zip(used, px)])  # (cameras, 4)
+    if not sigma.any():
+        return np.zeros((6, 6)), 0.0
+    steps = 1e-6 * np.eye(6)
+    J = np.stack([(corners(step) - corners(-step)) / 2e-6 for step in steps], -1)  # (cameras, 4, 2, 6)
+    back = np.linalg.pinv(J.reshape(-1, 6)).reshape(6, *px.shape)
+    each = back * (sigma / np.sqrt(2))[..., None]  # what one standard deviation of each coordinate does to the pose
+    common = each.sum(2).reshape(6, -1)
+    each = each.reshape(6, -1)
+    return (each @ each.T + common @ common.T) / 2, float(sigma.max())
 
 
 def _fitted(P: np.ndarray, quad: QuadEdges, lens: LensModel) -> np.ndarray:
