@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -88,7 +89,7 @@ class Result:
     beside: float  # processor time of rendering beside the run [s]
     pace: Pace | None  # how real time was kept, where it was
 
-    def as_json(self) -> dict:
+    def as_json(self) -> dict[str, Any]:
         """The object of `run --json`."""
         s = self.summary
         return {
@@ -188,7 +189,7 @@ def run(
         recorder = make_recorder(sink, scenario)
         system = make_diagram(scenario, recorder, meshcat=view, workers=workers, link=link, truth=truth)
         simulator = Simulator(system.diagram)
-        if recording:
+        if recording and view is not None:
             view.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat)
         begin = time.perf_counter()
         paced = scenario.station == "hardware" and not scenario.hardware.lockstep
@@ -391,7 +392,7 @@ class Replay:
     def real_time_factor(self) -> float:
         return self.end / max(self.wall_time, 1e-9)
 
-    def as_json(self) -> dict:
+    def as_json(self) -> dict[str, Any]:
         """The object of `replay --json`."""
         found = self.comparison
         return {
@@ -500,7 +501,8 @@ def _files_of(log: LogReader, scenario: Scenario, changed: Collection[str]) -> I
             if key not in changed and name in log.attachments:
                 paths[key] = Path(folder) / name
                 paths[key].write_bytes(log.attachments[name].data)
-        yield dc.replace(scenario, **{key: str(path) for key, path in paths.items()})
+        files: dict[str, Any] = {key: str(path) for key, path in paths.items()}
+        yield dc.replace(scenario, **files)
 
 
 def _feed(

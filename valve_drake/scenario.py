@@ -176,7 +176,7 @@ def resolve(scenario: Scenario) -> Scenario:
         if isinstance(value, Uniform):
             stream = np.random.Generator(np.random.SFC64([scenario.seed, zlib.crc32(key.encode())]))
             return float(stream.uniform(value.min, value.max))
-        if dc.is_dataclass(value):
+        if dc.is_dataclass(value) and not isinstance(value, type):
             return dc.replace(
                 value, **{f.name: draw(f"{key}.{f.name}", getattr(value, f.name)) for f in dc.fields(value)}
             )

@@ -45,7 +45,7 @@ _CAMERAS = ("left", "right")
 def paper_tables() -> dict[str, Any]:
     """The printed tables: T_m, and of each sample T_e, T_c, T_w; lengths in m, rotations made orthonormal (3, 4)."""
 
-    def rigid(rows: list) -> np.ndarray:
+    def rigid(rows: list[Any]) -> np.ndarray:
         T = np.array(rows, float)
         u, _, v = np.linalg.svd(T[:, :3])
         return frames.make(u @ v, T[:, 3] / 1000)
@@ -76,7 +76,7 @@ def converged(distance: float) -> StereoHead:
 # ---------------------------------------------------------------- images and what is read from them
 
 
-def draw(X_LV: np.ndarray, eyes: StereoHead, marker: Marker, paint: Callable = draw_board) -> list[Canvas]:
+def draw(X_LV: np.ndarray, eyes: StereoHead, marker: Marker, paint: Callable[..., Any] = draw_board) -> list[Canvas]:
     """What both cameras see of the target, still without noise."""
     out = []
     for lens, X_CL in zip(eyes.lenses(), _to_cameras(eyes)):
@@ -196,10 +196,10 @@ def table2(seed: int = 0, trials: int = 20) -> dict[str, Any]:
     eyes = converged(0.32)
     rows = [{"noise": "printed", "cameras": "paper", "method": "paper"} | _spread_row([printed], T_w)]
     clean = [draw(X, eyes, marker) for X in truths]
-    found: dict[tuple, list] = {}
+    found: dict[tuple[Any, ...], list[Any]] = {}
     for noise in NOISES:
         for _ in range(trials):
-            one: dict[tuple, list] = {}
+            one: dict[tuple[Any, ...], list[Any]] = {}
             for canvases, X, X_WL in zip(clean, truths, to_world):
                 edges = read([canvas.finish(rng, noise) for canvas in canvases], eyes, marker)[1]
                 for cameras, seen in (("one", one_camera(edges)), ("two", edges)):
@@ -255,8 +255,8 @@ def table3(seed: int = 0, trials: int = 60) -> dict[str, Any]:
     printed = tables["table_3"]["stereovision"]
     rows = [_table3_row("printed, stereo vision", "", printed, tables["table_4"]["stereovision"], None)]
     for noise in NOISES:
-        poses: dict[str, list] = {}
-        points: dict[str, list] = {}
+        poses: dict[str, list[Any]] = {}
+        points: dict[str, list[Any]] = {}
 
         for _ in range(trials):
             images = [canvas.finish(rng, noise) for canvas in clean]
@@ -346,7 +346,7 @@ def _bound_cells(
         middle = np.array([0.06, 0, z]) if z >= 0.5 else np.array([0, -0.012, z])
         for tilt in tilts:
             rng = np.random.default_rng([seed, round(1000 * z), tilt])
-            errors: dict[tuple, list] = {}
+            errors: dict[tuple[Any, ...], list[Any]] = {}
             for _ in range(4):
                 roll = rng.uniform(-0.7, 0.7) if z >= 0.5 else rng.uniform(-0.15, 0.15)
                 base = _tilted(middle, math.radians(tilt), rng.uniform(0, 2 * math.pi), roll)
@@ -386,7 +386,7 @@ def _cell_errors(
     eyes: StereoHead,
     marker: Marker,
     F: np.ndarray,
-    errors: dict[tuple, list],
+    errors: dict[tuple[Any, ...], list[Any]],
     peers: bool,
 ) -> None:
     """Adds one pair of images: e^T F e / 6 of `refined`, and of the other methods if `peers`."""
@@ -506,7 +506,7 @@ def _scene(
     return out
 
 
-def _distractors(rng: np.random.Generator, X: np.ndarray | None, marker: Marker) -> list[tuple]:
+def _distractors(rng: np.random.Generator, X: np.ndarray | None, marker: Marker) -> list[tuple[Any, ...]]:
     """Red discs (wheels), signs with a light bar, long boxes, squares at least a quarter larger or smaller than the
     marker, green marks; beside a marker they leave it free."""
     out = []

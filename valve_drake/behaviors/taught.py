@@ -3,6 +3,7 @@
 import dataclasses as dc
 import pathlib
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
         raise ConfigError(f"{source}: no taught references: must be a mapping of left and right")
     out = {}
     for side in SIDES:
-        values = {}
+        values: dict[str, Any] = {}
         for name, shape in _SHAPES.items():
             key = f"taught references {path}: {side}.{name}"
             try:
@@ -57,7 +58,7 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
                 value.shape == shape and bool(np.isfinite(value).all()), key, f"{shape} finite numbers", value.tolist()
             )
             values[name] = float(value) if shape == () else value
-        require(values["area"] > 0, f"taught references {path}: {side}.area", "> 0", values["area"])
+        require(float(values["area"]) > 0, f"taught references {path}: {side}.area", "> 0", values["area"])
         try:
             out[side] = TaughtReference(**values)
         except ConfigError as error:

@@ -59,7 +59,9 @@ def cameras(numbers: dict[str, Any], result: Calibration, size: tuple[int, int])
     if both:
         parts.append(_triangulation(numbers))
     lenses = numbers["lenses"].items()
-    rows = [(k + " (better)" * (k == result.better), f"{v['rms_px']:.3f}", v["parameters"]) for k, v in lenses]
+    rows: list[tuple[Any, ...]] = [
+        (k + " (better)" * (k == result.better), f"{v['rms_px']:.3f}", v["parameters"]) for k, v in lenses
+    ]
     parts += ["<h2>Lens models on the same corners</h2>", table(("model", "rms [px]", "parameters"), rows)]
     lens = [(name, value) for name, value in numbers["parameters"].items() if not name.startswith("X_LR")]
     rows = [(name, f"{value:.6g}", f"{sigmas[name]:.2g}") for name, value in lens]

@@ -21,7 +21,7 @@ def page(numbers: dict[str, Any], corners: Sequence[np.ndarray], size: tuple[int
     marked = [view["outlier"] for view in views]
     told = f"{len(views) - sum(marked)} views used, written to {numbers['out']}"
     parts = [pages.head(title, told, numbers["warnings"], figures)]
-    rows = [[f"{value:.6f}" for value in row] for row in numbers["X_EC"]]
+    rows: list[Sequence[str]] = [[f"{value:.6f}" for value in row] for row in numbers["X_EC"]]
     parts += [f"<h2>{key}</h2>", pages.table(("x", "y", "z", "position [m]"), rows)]
     spread = numbers["X_EC_sigma"]
     rows = [(a, f"{d:.3g}", f"{p:.3g}") for a, d, p in zip("xyz", spread["rotation_deg"], spread["position_mm"])]

@@ -12,6 +12,7 @@ import dataclasses as dc
 import functools
 import typing
 from collections.abc import Mapping
+from typing import Any
 
 import cv2
 import numpy as np
@@ -246,7 +247,7 @@ class _Film:
     delivered: Capture = Capture()
     coming: tuple[Capture, ...] = ()
 
-    def __deepcopy__(self, memo: dict) -> "_Film":
+    def __deepcopy__(self, memo: dict[int, Any]) -> "_Film":
         return self
 
 
