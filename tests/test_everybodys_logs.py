@@ -249,6 +249,7 @@ def test_whatever_is_done_to_a_file_is_told_and_costs_only_what_was_hit(tmp_path
         assert kept.total() >= 40 - 8, "one chunk, or fewer messages, at most"
     if kind in (1, 4) and not chunked and found:
         assert kept.total() == sum(end <= at for end in ends(data)), "all up to the cut"
+        assert kept.total() == len(found), "and nothing made of a part and zeros"
     recover(path, tmp_path / "b.mcap")
     new = LogReader(tmp_path / "b.mcap")
     assert new.damage == [] and ours(new) == ours(log) == by_the_package(tmp_path / "b.mcap")
@@ -511,6 +512,15 @@ def test_an_image_that_claims_gigabytes_is_not_decoded(tmp_path, capsys):
     path = log_of(tmp_path / "a.mcap", ("/head_left/image", lambda k: frame), ("/supervisor/mode", mode))
     assert run(capsys, "review", path)[0] == 0
     assert "cannot be decoded" in (tmp_path / "a.review.html").read_text()
+
+
+def test_messages_of_one_time_have_no_rate(tmp_path, capsys):
+    with LogWriter(tmp_path / "a.mcap") as log:
+        for _ in range(5):
+            log.write("/supervisor/mode", ModeState(), 0.0)
+        log.write("/a", Status(), 1.0)
+    code, out, err = run(capsys, "review", tmp_path / "a.mcap")
+    assert code == 0 and err == "" and "gaps" not in out
 
 
 def test_a_log_of_one_message_a_topic_has_a_page(tmp_path, capsys):

@@ -278,7 +278,7 @@ class Contents:
 
     def _torn(self, end: int) -> bool:
         """Whether zeros lie across the end of a record: a disk that lost power had only a part of it."""
-        return not any(self._data[end - 4 : end + 4])
+        return not any(self._data[end - 1 : end + 8])
 
     def _define(self, record: Frame, definition: Schema | Channel) -> None:
         """Takes a definition unless one of its id is known."""
