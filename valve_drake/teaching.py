@@ -16,7 +16,7 @@ from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.kinematics import GEOMETRY
-from valve_drake.messages import LEFT, SIDES
+from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.perception.handle_marker import find_mark
 from valve_drake.scenario import Scenario, resolve
 from valve_drake.stations.camera_rig import CameraRig, Capture
@@ -46,9 +46,9 @@ def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.
     X_BV = compose(inverse(planar(*base)), X_WV)
     straight = {side: np.array([0.0, 0.0, 1.0]) for side in SIDES}  # the view direction is not known yet
     arc = best_arc(X_BV, np.pi / 2, GEOMETRY, marker, StanceConfig(), straight)
-    if arc.margin < 0:
+    if arc.margin < 0 or arc.q_left is None or arc.q_right is None:
         raise ConfigError("teach: the hands do not reach the handles")
-    q0 = {LEFT: arc.q_left, "right": arc.q_right}
+    q0 = {LEFT: arc.q_left, RIGHT: arc.q_right}
     taught, pictures = {}, {}
     for side in SIDES:
         X_HG = compose(inverse(GEOMETRY.X_BH()), X_BV, hand_in_valve(side, arc.swapped, marker))
