@@ -53,7 +53,8 @@ class CameraWorkers:
 
     def __exit__(self, *_: object) -> None:
         for worker in self._workers:
-            worker.wire.close()  # which ends it
+            worker.wire.close()
+            worker.process.terminate()  # the closed wire would end it, but only after the image that it makes
         for worker in self._workers:
             worker.process.wait()
         self._workers = []
