@@ -86,7 +86,7 @@ class Result:
     log_error: str  # why logging stopped; `say` was told
     troubles: tuple[str, ...]  # what else went wrong, in lines for the user
     shares: dict[str, float]  # of the wall time, by kind of work; of rendering, what the run waited for
-    beside: float  # processor time of rendering beside the run [s]
+    render_worker_seconds: float  # processor time of the rendering processes [s]
     pace: Pace | None  # how real time was kept, where it was
 
     def as_json(self) -> dict[str, Any]:
@@ -110,7 +110,7 @@ class Result:
             "turn_mean_stem_force_N": s.turn_mean_stem_force_N,
             "turn_share_left": s.turn_share_left,
             "shares": {kind: round(share, 4) for kind, share in self.shares.items()},
-            "rendering_beside_s": self.beside,
+            "rendering_beside_s": self.render_worker_seconds,
             "pace": self.pace and self.pace.as_json(),
             "log": str(self.log) if self.log else None,
             "log_error": self.log_error,
@@ -166,8 +166,8 @@ def run(
     duration: stop then, whatever the mode [s]. live: also gets all that is logged. link: to the robot of
     station `hardware`, else made of the scenario. show: called every STEP. say: told what the user should know.
     stop: True makes the operator's stop.
-    Raises ConfigError, OperationFailed before the first message is logged, and leaves no file then. What goes wrong
-    later is in the result.
+    Raises ConfigError or OperationFailed before the first message is logged, and leaves no file then. Later failures
+    are in the result.
     """
     scenario = resolve(scenario)
     scenario.check()
@@ -343,10 +343,10 @@ def _advance(
 
 
 def _in_real_time(simulator: Simulator, pacer: Pacer, sink: Sink) -> Callable[[float], None]:
-    """AdvanceTo, held to the wall's clock tick by tick: from the station's being read to the commands, which leave as
-    slot 3 begins; then, with nobody waiting, slot 3 itself."""
+    """AdvanceTo, paced by the wall clock, in two parts a tick: the first ends when the commands are sent, at the start
+    of slot 3; the second is slot 3, whose slow work delays no command."""
     gc.collect()
-    gc.freeze()  # what is there stays: a collection that looks at it all would take several ticks
+    gc.freeze()  # a garbage collection that walks the whole diagram would take several ticks
     context = simulator.get_context()
 
     def go(until: float) -> None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from valve_drake.runner import Progress
 
 OK, FAILED, BAD_INPUT, DAMAGED = 0, 1, 2, 3  # exit codes
-ECHO = 0.3  # a signal again within this time is the same one: a closing terminal and `timeout` send theirs twice [s]
+ECHO = 0.3  # a signal repeated within this time counts once: a closing terminal and `timeout` send two [s]
 Subcommands: TypeAlias = "argparse._SubParsersAction[Parser]"
 
 

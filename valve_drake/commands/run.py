@@ -95,7 +95,7 @@ def command(options: argparse.Namespace) -> int:
     if options.profile and not options.json:
         for kind, share in sorted(result.shares.items(), key=lambda item: -item[1]):
             print(f"{kind:>10}  {100 * share:5.1f} %  {share * result.wall_time:6.2f} s")
-        print(f"{result.beside:.2f} s of rendering on other processors; above, what the run waited for")
+        print(f"{result.render_worker_seconds:.2f} s of rendering on other processors; above, what the run waited for")
     for line in troubles:
         complain(line)
     cut_short = options.duration is not None and not result.summary.outcome

@@ -31,8 +31,8 @@ from valve_drake.recording.active import ActiveFile
 from valve_drake.recording.container import CHUNK_SIZE, Chunk, Definition, McapFile, definition
 from valve_drake.recording.foxglove import NANO, nanoseconds
 
-FLUSH_PERIOD = NANO // 2  # of the messages' time [ns]
-MAX_BACKLOG = 256 << 20  # waiting for the disk [bytes]
+FLUSH_PERIOD = NANO // 2  # of the messages' time: what a crash can lose; raise it for a slow disk [ns]
+MAX_BACKLOG = 256 << 20  # waiting for the disk; raise it if a disk stalls for longer and memory allows [bytes]
 
 
 class LogError(OperationFailed):
