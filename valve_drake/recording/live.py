@@ -1,7 +1,7 @@
 """The log's channels served live to Foxglove over its WebSocket: a sink for the recorder, beside the log's writer.
 
-Only topics with a subscriber are sent. A new subscriber gets the topic's last message at once, because the scene and the
-calibrations are sent rarely. The server never blocks the control loop: a client that is too slow loses messages.
+Only topics with a subscriber are sent. A new subscriber gets the topic's last message at once, because the scene and
+the calibrations are sent rarely. The server never blocks the control loop: a client that is too slow loses messages.
 """
 
 from types import TracebackType
