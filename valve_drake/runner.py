@@ -193,7 +193,7 @@ def run(
             view.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat)
         begin = time.perf_counter()
         paced = scenario.station == "hardware" and not scenario.hardware.lockstep
-        pacer = Pacer(idle=link.pass_time) if paced else None
+        pacer = Pacer(idle=link.pass_time) if paced and link is not None else None
         go = simulator.AdvanceTo if pacer is None else _in_real_time(simulator, pacer, sink)
         last, told = Progress(ModeState(), 0.0, 0.0), False
 

@@ -37,7 +37,7 @@ def _grid(lens: LensModel) -> tuple[np.ndarray, np.ndarray]:
 def _second_integral(x: np.ndarray, s: float) -> np.ndarray:
     """Of the blurred step Phi(x / s), twice over x."""
     phi = np.exp(-0.5 * (x / s) ** 2) / math.sqrt(2 * math.pi)
-    return (x * x + s * s) / 2 * (1 + _ERF(x / (s * math.sqrt(2))).astype(float)) / 2 + x * s / 2 * phi
+    return (x * x + s * s) / 2 * (1 + np.asarray(_ERF(x / (s * math.sqrt(2))), float)) / 2 + x * s / 2 * phi
 
 
 @functools.lru_cache(maxsize=4096)

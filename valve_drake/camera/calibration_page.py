@@ -65,7 +65,7 @@ def cameras(numbers: dict[str, Any], result: Calibration, size: tuple[int, int])
     parts += ["<h2>Lens models on the same corners</h2>", table(("model", "rms [px]", "parameters"), rows)]
     lens = [(name, value) for name, value in numbers["parameters"].items() if not name.startswith("X_LR")]
     rows = [(name, f"{value:.6g}", f"{sigmas[name]:.2g}") for name, value in lens]
-    if both:
+    if both and fit.X_LR is not None:
         rotation, spread = np.degrees(frames.rotation_vector(fit.X_LR[:, :3])), numbers["X_LR_sigma"]
         for k, axis in enumerate("xyz"):
             rows.append((f"X_LR rotation {axis} [deg]", f"{rotation[k]:.4f}", f"{spread['rotation_deg'][k]:.2g}"))

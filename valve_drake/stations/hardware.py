@@ -503,7 +503,7 @@ class LcmReceiver(LeafSystem):
             if spec.direction == "in":
                 continue
             if isinstance(spec.kind, int):
-                calc = functools.partial(self._calc_vector, spec.name)
+                calc: Callable[..., None] = functools.partial(self._calc_vector, spec.name)
                 self.DeclareVectorOutputPort(spec.name, spec.kind, calc, when)
             else:
                 calc = self._calc_health if spec.kind is Health else self._calc_image(spec.name.partition(".")[0])

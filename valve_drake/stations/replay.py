@@ -79,7 +79,7 @@ class Recording:
             if topic in IMAGES:
                 images.add((topic, time))
                 continue
-            message = log.decode(record)
+            message: Any = log.decode(record)
             if topic == JOINTS:
                 self._add_joints(time, message)
             elif topic in WRENCHES:
@@ -99,7 +99,8 @@ class Recording:
         """The frame with its image, as recorded at `time`."""
         if header.sequence < 0:
             return header
-        for _, _, message in self._log.messages([f"/{header.camera}/image"], time, time):
+        for _, _, recorded in self._log.messages([f"/{header.camera}/image"], time, time):
+            message: Any = recorded
             stamp = message.timestamp
             if stamp.seconds * NANO + stamp.nanos == nanoseconds(header.time):
                 data = message.data

@@ -15,7 +15,7 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.controllers import InverseDynamics
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
 from pydrake.systems.primitives import AffineSystem, ConstantVectorSource, MatrixGain, Multiplexer
 
 from valve_drake.camera.lens import Lens, StereoHead
@@ -59,7 +59,7 @@ class ServoDriver(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(TICK, 3 * SLOT, self._integrate)
         self.DeclareVectorOutputPort("desired", 10, self._calc)
 
-    def _begin(self, context: Context, state: object) -> None:
+    def _begin(self, context: Context, state: DiscreteValues) -> None:
         state.set_value(int(self._pose), np.concatenate([self._start, np.zeros(3)]))
 
     def _now(self, context: Context) -> tuple[float, float, float, float, float]:
@@ -69,7 +69,7 @@ class ServoDriver(LeafSystem):
         middle = h + w * dt / 2
         return x + v * dt * math.cos(middle), y + v * dt * math.sin(middle), h + w * dt, v, w
 
-    def _integrate(self, context: Context, state: object) -> None:
+    def _integrate(self, context: Context, state: DiscreteValues) -> None:
         pose = self._now(context)[:3]
         state.set_value(int(self._pose), [*pose, context.get_time(), *self._twist.Eval(context)])
 

@@ -281,7 +281,7 @@ class Twin:
                 self._requested = (self.time, read_request(message))
             elif key == MODE:
                 self.faults.enter(read_mode(message), self.time)
-            else:
+            elif row.read is not None:
                 self._command(key, row.read(message), getattr(message, row.stamp))
             self._bad.good(row.device, self.time)
         except WrongMessage as error:
@@ -311,7 +311,11 @@ class Twin:
         for frame in self._frames(time):
             self._put_image(frame, time)
         if self.tick % round(self._hardware.robot_period / TICK) == 0 and not self.faults.silent("robot", time):
-            state = {"protocol": PROTOCOL, **JOINTS, "estop": self.faults.acts("estop", "robot", time)}
+            state: dict[str, float] = {
+                "protocol": PROTOCOL,
+                **JOINTS,
+                "estop": self.faults.acts("estop", "robot", time),
+            }
             words = [*self._guard.faults(time), *self._bad.faults(time)]
             state |= dict.fromkeys(words, 1.0)
             if self._bus.others(ROBOT):
@@ -347,7 +351,7 @@ class Twin:
             period = self._camera.head_period if camera.startswith("head") else self._camera.wrist_period
             there = math.floor((time - TICK - self._camera.latency) / period)  # delivered before this tick
             if there > self._shown[camera]:
-                frame = self.read(f"{camera}.image")
+                frame: Any = self.read(f"{camera}.image")
                 self._shown[camera] = frame.sequence
                 frames.append(frame)
         return frames
