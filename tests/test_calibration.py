@@ -289,6 +289,21 @@ def test_pairs_of_other_moments_are_said_to_be_no_pairs_and_not_a_vague_focal_le
         cal.calibrate(two, SIZE)
 
 
+def test_images_of_one_camera_and_cameras_above_one_another_are_no_head():
+    poses = boards.tilted(5, np.random.default_rng(45), 0.45)
+    one = views((PAPER,), poses, 0.1, 46)
+    twice = [dc.replace(view, names=view.names * 2, px=view.px * 2) for view in one]
+    swapped = [dc.replace(view, px=view.px[::-1]) for view in views((PAPER, PAPER), poses, 0.1, 46)]
+    below = views(
+        (PAPER,), [frames.compose(frames.make(np.eye(3), np.array([0, -0.1, 0.02])), X) for X in poses], 0.1, 47
+    )
+    vertical = [dc.replace(a, names=a.names * 2, px=(*a.px, *b.px)) for a, b in zip(one, below)]
+    for seen, says in ((twice, "0.001 to 10 m apart"), (swapped, "on the right"), (vertical, "one camera is above")):
+        with pytest.raises(ConfigError, match=says) as error:
+            cal.calibrate(seen, SIZE)
+        assert "\n" not in str(error.value)
+
+
 def in_the_middle(lens, n: int = 12) -> list[np.ndarray]:
     """Poses whose boards fill the middle of the image only."""
     return [frames.make(X[:, :3], X[:, 3] * [0.3, 0.3, 1.6]) for X in boards.tilted(n, np.random.default_rng(51), 0.45)]

@@ -27,28 +27,28 @@ import numpy as np
 from valve_drake import frames
 from valve_drake.camera.board import Board
 from valve_drake.camera.least_squares import divided, minimize, skew, stepped, transform
-from valve_drake.camera.lens import KNOWN, Lens, LensModel, OpenCvLens, StereoHead
+from valve_drake.camera.lens import KNOWN, Lens, LensModel, OpenCvLens, StereoHead, check_baseline
 from valve_drake.checks import ConfigError
 
 KINDS = ("opencv", "paper")
 RANGES = (0.5, 1.0, 2.0)  # at which points are triangulated [m]
 MIN_VIEWS = 3
-_MAX_FOCAL_SIGMA = 0.02  # a focal length known less well than this (relative) is none
-_MIN_TILT = 8.0  # of the steepest board, and between two: less does not tell the focal length from distance [deg]
+_MAX_FOCAL_SIGMA = 0.02  # relative standard deviation of a focal length above which the calibration is refused
+_MIN_TILT = 8.0  # the steepest board, and two boards against each other, must be tilted by this much [deg]
 _TILT = "tilt it by up to 45 deg to all sides, or give --distances"
-_OUTLIER = 2.5  # times the median view's rms
-_APART = 0.15  # turn [rad] plus shift over the boards' distance by which pairs put the right camera elsewhere
+_OUTLIER = 2.5  # a view with more than this times the median view's rms is named
+_APART = 0.15  # a pair whose X_LR differs more (turn [rad] + shift / distance of the boards) is named as a misfit
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 # Sets of distortion terms, as indices of _COEFFICIENTS: k3 never without k2, nor k2 without k1. The first is the start.
 _TERMS = ((0, 1, 2, 3, 4), (0, 1, 2, 3), (0, 2, 3), (2, 3), (0, 1, 4), (0, 1), (0,), ())
 _FRONTAL_TERMS = ((0,), ())
-_POWER = (2, 4, 1, 1, 6)  # of the radius, by which each acts
+_POWER = (2, 4, 1, 1, 6)  # the power of the radius with which each term acts
 _PRIOR = (0.2, 0.1, 2e-3, 2e-3, 0.05)  # what each may change at the image's corner, relative to the radius
 _MAP = (7, 9)  # rows and columns of the map of standard deviations
 _POOR = 0.2  # rms of a camera's corners beyond which a fisheye's model is tried [px]
-_FISHEYE = 0.6  # of a pinhole's rms, below which a fisheye's says that it is one
-_WORSE = 1.2  # by how much fewer terms may raise the rms, so that the lens maps the whole image one to one
-_MISFIT = 10.0  # rms of both cameras over that of each alone, beyond which the pairs are none
+_FISHEYE = 0.6  # the images are a fisheye's if its model leaves less than this share of the pinhole's rms
+_WORSE = 1.2  # factor by which the rms may rise when terms are dropped to keep the lens from folding back
+_MISFIT = 10.0  # pairs are refused if both cameras together leave more than 1 px + this times each one's own rms
 
 
 @dc.dataclass(frozen=True)
@@ -294,7 +294,7 @@ def calibrate(
     least = 2 if rigid else MIN_VIEWS
     if len(views) < least:
         raise ConfigError(f"the board was found in {len(views)} view(s): a calibration needs at least {least}")
-    # Boards that are all frontal show little of a lens: what they cannot tell must not be fitted.
+    # Boards that all face the camera determine at most k1.
     sets = _FRONTAL_TERMS if rigid else _TERMS
     start = _start(views, size, _OpenCvKind(sets[0]), rigid, board)
     views = start.views
@@ -307,6 +307,8 @@ def calibrate(
         except np.linalg.LinAlgError as error:
             raise ConfigError(f"degenerate: the boards do not determine a camera: {_TILT}") from error
     _refuse_misfits(fits["opencv"], start)
+    if start.X_LR is not None:
+        check_baseline(fits["opencv"].head(), "--left and --right: X_LR")
     _refuse_fisheye(start, size)
     fits["opencv"] = _determined(fits["opencv"], views, sets, size)
     kinds["opencv"] = _OpenCvKind(_free(fits["opencv"]))
@@ -508,7 +510,7 @@ def _one_right_camera(
     best: tuple[float, np.ndarray] | None = None
     for X in (X for one in candidates for X in one):
         nearest = [min(distance(X, other, scale) for other in one) for one in candidates]
-        # Where all boards lie alike every numbering fits: then the cameras look alike.
+        # If all boards lie alike, every numbering fits; prefer the one by which both cameras look the same way.
         cost = float(np.minimum(nearest, _APART).sum()) + 1e-3 * distance(np.eye(3, 4), X, scale)
         if best is None or cost < best[0]:
             best = cost, X
