@@ -15,6 +15,7 @@ from valve_drake.supervisor.command_selector import (
     BEHAVIORS,
     GRIPPERS,
     GROUPS,
+    HOLD,
     JOINTS,
     PORTS,
     SOURCE,
@@ -587,3 +588,23 @@ def test_bad_config_is_refused_by_name(changes, words):
 
 def test_verdicts_and_modes_travel_as_plain_text():
     assert str(Mode.TURN) == "turn" and str(Verdict.END_STOP) == "end_stop"
+
+
+def test_whoever_commands_a_group_in_a_mode_is_awake_in_it():
+    from valve_drake.behaviors.base_approach_system import BaseApproachSystem
+    from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
+    from valve_drake.behaviors.image_servo_system import ImageServoSystem
+    from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
+    from valve_drake.behaviors.valve_search_system import ValveSearchSystem
+    from valve_drake.supervisor.supervisor import OWNER
+
+    awake = {
+        "valve_search": ValveSearchSystem.AWAKE,
+        "base_approach": BaseApproachSystem.AWAKE,
+        "kinematic_approach": KinematicApproachSystem.AWAKE,
+        "image_servo": ImageServoSystem.AWAKE,
+        "hybrid_rotation": HybridRotationSystem.AWAKE,
+    }
+    for mode, row in SOURCE.items():
+        for block in {*row.values(), OWNER.get(mode, HOLD)} & set(awake):
+            assert awake[block] is None or mode in awake[block], f"{block} in {mode}"

@@ -11,8 +11,8 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from valve_drake.messages import Health, Status, StereoPosition
-from valve_drake.ports import SLOT, TICK, Block, Inputs, lock, profile
+from valve_drake.messages import Health, Mode, ModeState, Status, StereoPosition
+from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs, lock, profile
 
 
 class CounterInputs(Inputs):
@@ -304,3 +304,58 @@ def test_what_can_wait_runs_in_slot_3_on_what_the_step_left_and_only_where_it_is
     plain = Rig(Counter())
     plain.run(TICK)
     assert plain.block.memory(plain.context) == 1
+
+
+# ---------------------------------------------------------------- blocks that sleep
+
+
+class SleeperInputs(Inputs):
+    mode: ModeState
+
+
+class Sleeper(Block[SleeperInputs, int]):
+    """Counts its steps; awake while turning."""
+
+    AWAKE = frozenset((Mode.TURN,))
+    OUTPUTS = {"status": Status}
+
+    def __init__(self) -> None:
+        super().__init__("sleeper")
+
+    def initial(self) -> int:
+        return 0
+
+    def step(self, time: float, inputs: SleeperInputs, memory: int) -> tuple[int, Outputs]:
+        return memory + 1, {"status": Status(time=time, activation=inputs.mode.activation)}
+
+
+def test_a_block_steps_in_its_modes_and_once_in_any_other():
+    """It says once that it is idle, so that whoever reads its status sees the activation; then nothing is logged."""
+    block = Sleeper()
+    simulator = Simulator(block)
+    context = simulator.get_mutable_context()
+    steps, statuses = [], []
+    for k, (mode, activation) in enumerate(
+        [(Mode.IDLE, 0), (Mode.SEARCH, 1), (Mode.TURN, 2), (Mode.RELEASE, 3), (Mode.TURN, 4)]
+    ):
+        block.GetInputPort("mode").FixValue(context, Value(ModeState(mode=mode.value, activation=activation)))
+        before = block.memory(context)
+        for tick in range(4):
+            simulator.AdvanceTo((4 * k + tick + 1) * TICK)
+            statuses.append(block.GetOutputPort("status").Eval(context))
+            if tick == 0:
+                assert block.memory(context) == before + 1  # it wakes, or falls asleep, in the mode's first tick
+        steps.append(block.memory(context) - before)
+    assert steps == [1, 1, 4, 1, 4]
+    assert statuses[0] is statuses[3] and statuses[4] is statuses[7]  # held, so that a log has it once
+    assert [s.activation for s in statuses[::4]] == [0, 1, 2, 3, 4]
+
+
+def test_a_sleeping_block_is_the_same_in_a_clone():
+    block = Sleeper()
+    simulator = Simulator(block)
+    block.GetInputPort("mode").FixValue(simulator.get_mutable_context(), Value(ModeState(mode="search", activation=1)))
+    simulator.AdvanceTo(4 * TICK)
+    clone = Simulator(block, simulator.get_context().Clone())
+    clone.AdvanceTo(8 * TICK)
+    assert block.memory(clone.get_context()) == block.memory(simulator.get_context()) == 1

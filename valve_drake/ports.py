@@ -164,11 +164,13 @@ class Block(LeafSystem, Generic[In, M]):
     """A stage on ports. A subclass names its Inputs and its memory's type, sets OUTPUTS and writes `step`.
 
     OUTPUTS: port name -> message class, or vector size. INPUTS: ports beside the annotated ones, for names that come
-    from a table.
+    from a table. AWAKE: a block with an input port `mode` steps in these modes; of another mode it takes one step, the
+    first, and then its outputs hold: nobody listens, and nothing is logged.
     """
 
     INPUTS: ClassVar[Mapping[str, Kind]] = {}
     OUTPUTS: Mapping[str, Kind] = {}
+    AWAKE: ClassVar[frozenset[str] | None] = None  # the modes in which it steps; None: in all
     _inputs: ClassVar[type[Inputs]] = Inputs
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -227,10 +229,18 @@ class Block(LeafSystem, Generic[In, M]):
         return memory
 
     def _update(self, work: "Step", context: Context, state: State) -> None:
+        inputs = self._inputs(self, context)
+        activation = None
+        if self.AWAKE is not None:
+            mode = inputs.read("mode", _REQUIRED)
+            if mode.mode not in self.AWAKE:
+                activation = mode.activation
+                if context.get_abstract_state(int(self._memory)).get_value().asleep == activation:
+                    return
         with profile("stages"):
-            memory, outputs = work(context.get_time(), self._inputs(self, context), self.memory(context))
+            memory, outputs = work(context.get_time(), inputs, self.memory(context))
         abstract = state.get_mutable_abstract_state()
-        abstract.get_mutable_value(int(self._memory)).set_value(_Held(memory))
+        abstract.get_mutable_value(int(self._memory)).set_value(_Held(memory, activation))
         for port, value in outputs.items():
             kind = self.OUTPUTS[port]
             if isinstance(kind, int):
@@ -248,11 +258,12 @@ class _Held:
     """Carries a block's memory through Drake's state copies without copying it: its arrays are locked, so that no step
     of one Context can change what a clone holds too."""
 
-    __slots__ = ("value",)
+    __slots__ = ("asleep", "value")
 
-    def __init__(self, value: Any):
+    def __init__(self, value: Any, asleep: int | None = None):
         lock(value)
         self.value = value
+        self.asleep = asleep  # the activation of a mode that has had its one step; None: awake
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "_Held":
         return self

@@ -10,7 +10,7 @@ from valve_drake.ports import TICK
 from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.layout import HEAD, WRIST
 from valve_drake.recording.reader import LogReader
-from valve_drake.recording.signals import BEHAVIORS, SLOW, TRUTH
+from valve_drake.recording.signals import SLOW, TRUTH
 
 CAMERAS = HEAD + WRIST
 
@@ -22,12 +22,7 @@ PERIODS: dict[str, float] = {
 }
 # Outputs that a block writes at every step: the expected rate is the median rate of the log itself.
 STEADY = frozenset(
-    (
-        *(f"/{block}/command" for block in BEHAVIORS),
-        "/valve_search/status",
-        "/base_approach/status",
-        "/image_servo/servo",
-    )
+    ("/valve_search/command", "/valve_search/status")
     + ("/command_selector/report", "/supervisor/mode", "/robot_state/robot_state", "/health", "/tf")
 )
 # Topics that follow the cameras: images are taken only when the mode asks for them, so no rate is expected.

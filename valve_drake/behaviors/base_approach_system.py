@@ -1,6 +1,6 @@
 """Block `base_approach`: stages 1 and 2 on ports. No mathematics here."""
 
-from valve_drake.behaviors.base_approach import BaseApproachConfig, Memory, step
+from valve_drake.behaviors.base_approach import MODES, BaseApproachConfig, Memory, step
 from valve_drake.messages import Command, ModeState, RectangleEstimate, RobotState, Stance, Status, StereoPosition
 from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK, Block, Inputs, Outputs
@@ -28,6 +28,7 @@ class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
     status       out  Status
     """
 
+    AWAKE = frozenset(MODES)
     OUTPUTS = {"command": Command, "status": Status}
 
     def __init__(self, config: BaseApproachConfig, marker: Marker, name: str = "base_approach"):

@@ -1,6 +1,6 @@
 """Block `hybrid_rotation`: stage 5 on ports. No mathematics here."""
 
-from valve_drake.behaviors.hybrid_rotation import HybridRotation, Memory
+from valve_drake.behaviors.hybrid_rotation import AT_VALVE, HybridRotation, Memory
 from valve_drake.messages import Command, GraspPlan, ModeState, RobotState, Status, TurnState
 from valve_drake.ports import TICK, Block, Inputs, Outputs
 
@@ -24,6 +24,7 @@ class HybridRotationSystem(Block[HybridRotationInputs, Memory]):
     turn         out  TurnState   telemetry: angle, couple, forces
     """
 
+    AWAKE = frozenset(AT_VALVE)
     OUTPUTS = {"command": Command, "status": Status, "turn": TurnState}
 
     def __init__(self, law: HybridRotation, name: str = "hybrid_rotation"):

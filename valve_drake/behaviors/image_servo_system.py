@@ -1,7 +1,7 @@
 """Block `image_servo`: stage 4 on ports. No mathematics here."""
 
 from valve_drake.behaviors.image_servo import ImageServo, Memory
-from valve_drake.messages import Command, HandleMarks, ModeState, RobotState, ServoState, Status
+from valve_drake.messages import Command, HandleMarks, Mode, ModeState, RobotState, ServoState, Status
 from valve_drake.ports import TICK, Block, Inputs, Outputs
 
 
@@ -24,6 +24,7 @@ class ImageServoSystem(Block[ImageServoInputs, Memory]):
     servo        out  ServoState   telemetry
     """
 
+    AWAKE = frozenset((Mode.SERVO,))
     OUTPUTS = {"command": Command, "status": Status, "servo": ServoState}
 
     def __init__(self, law: ImageServo, name: str = "image_servo"):

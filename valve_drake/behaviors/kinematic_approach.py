@@ -149,11 +149,12 @@ class KinematicApproach:
     ) -> tuple[Memory, Command]:
         """One tick -> new memory (with status, stance and plan in it), command. `watch_stance` follows it."""
         measured = np.concatenate([state.left_arm, state.right_arm])
-        m, first = memory, memory.activation < 0
+        m = memory
+        mine_again = m.activation < 0 or (mode.activation != m.activation and m.mode in NOT_OWNED)
         if mode.activation != m.activation:
             m = dc.replace(m, activation=mode.activation, mode=mode.mode, phase="start", since=time, looks=())
             m = dc.replace(m, status=Status(time=time, activation=mode.activation, state="idle"))
-        if first or mode.mode in NOT_OWNED:
+        if mine_again or mode.mode in NOT_OWNED:
             m = dc.replace(m, q=measured, path=None)
         if mode.mode in NOT_OWNED:
             return m, Command(time=time)

@@ -1,10 +1,11 @@
 """Block `kinematic_approach`: stage 3 on ports. No mathematics here."""
 
-from valve_drake.behaviors.kinematic_approach import KinematicApproach, Memory
+from valve_drake.behaviors.kinematic_approach import NOT_OWNED, KinematicApproach, Memory
 from valve_drake.messages import (
     Command,
     GraspPlan,
     HandleMarks,
+    Mode,
     ModeState,
     RectangleEstimate,
     RobotState,
@@ -39,6 +40,7 @@ class KinematicApproachSystem(Block[KinematicApproachInputs, Memory]):
     plan         out  GraspPlan          the valve and the grasps in B, measured at rest
     """
 
+    AWAKE = frozenset(Mode) - frozenset(NOT_OWNED)
     OUTPUTS = {"command": Command, "status": Status, "stance": Stance, "plan": GraspPlan}
 
     def __init__(self, law: KinematicApproach, name: str = "kinematic_approach"):
