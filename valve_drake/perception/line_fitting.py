@@ -194,7 +194,7 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
     sides, reasons = _place(sheet, coarse, config)
     fits = np.array([not reason for reason in reasons])
     own = _where(fits)
-    fitted = iter(_fit_sides(sheet[own], sides[own], config) if fits.any() else ())
+    fitted = iter(_fit_each(sheet[own], sides[own], config) if fits.any() else ())
     for q, k in enumerate(number):
         raw = next(fitted) if fits[q] else RawQuad(reason=reasons[q])
         if int(_REACH * raw.blur) > sides.half[q]:
@@ -202,7 +202,7 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
             one = slice(q, q + 1)
             wide, (reason,) = _place(sheet[one], coarse[one], config, _REACH * raw.blur)
             if not reason and wide.half[0] > sides.half[q]:
-                raw = _fit_sides(sheet[one], wide, config)[0]
+                raw = _fit_each(sheet[one], wide, config)[0]
         if not raw.reason:
             back = lows[q] - sheet.low[q]
             together = None if raw.together is None else raw.together + back
@@ -471,6 +471,17 @@ class _Followed:
     normal: np.ndarray  # (S, 6, 6), see `_levels`
     width: np.ndarray  # blur that the last step was linear about [px] ...
     blur: np.ndarray  # ... and the one found
+
+
+def _fit_each(sheet: Sheet, sides: _Sides, config: SidesConfig) -> list[RawQuad]:
+    """All quadrilaterals in one pass; each alone if one of them has no solution, which then says so."""
+    try:
+        return _fit_sides(sheet, sides, config)
+    except np.linalg.LinAlgError:
+        count = len(sides.half)
+        if count == 1:
+            return [RawQuad(reason="the light beside the sides does not determine them")]
+        return [_fit_each(sheet[k : k + 1], sides[k : k + 1], config)[0] for k in range(count)]
 
 
 def _fit_sides(sheet: Sheet, sides: _Sides, config: SidesConfig) -> list[RawQuad]:

@@ -30,6 +30,7 @@ from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require
 from valve_drake.config import Config, choice, number
 from valve_drake.messages import MarkerEdges, QuadEdges, RectangleEstimate
+from valve_drake.perception.color_segmentation import middle
 from valve_drake.perception.joint_fit import NODES, meet
 from valve_drake.perception.line_fitting import side_lines
 from valve_drake.perception.marker import NEXT, Marker
@@ -376,7 +377,8 @@ def _moments(views: list[_View], weights: list[np.ndarray], config: RectangleEst
     lengths = np.sqrt((along * along).sum(2)) * np.array([[view.focal] for view in views])
     # A side is not better known than its common bias, however many points it has.
     biases = config.side_bias * np.minimum(np.maximum((_SHORT_SIDE / lengths) ** 3, 1), 10)
-    biases = np.hypot(biases, [_UNEVEN_BIAS * view.bias for view in views])
+    if any(view.bias.any() for view in views):
+        biases = np.hypot(biases, [_UNEVEN_BIAS * view.bias for view in views])
     told = [k for k, view in enumerate(views) if view.information.any()]
     if told:
         # Two nodes make a side: each has twice the variance of the bias.
@@ -914,9 +916,7 @@ def _triangulated_distance(views: list[_View]) -> float:
     """Distance of the centre, from where the diagonals meet in both images."""
     rays = []
     for view in views:
-        c = np.column_stack([view.corners, np.ones(4)])
-        centre = _cross(_cross(c[0], c[2]), _cross(c[1], c[3]))
-        rays.append(view.X_CL[:, :3].T @ (centre / centre[2]))
+        rays.append(view.X_CL[:, :3].T @ np.array([*middle(view.corners), 1.0]))
     p_LR = -views[1].X_CL[:, :3].T @ views[1].X_CL[:, 3]
     a, b = rays
     aa, ab, bb = a @ a, a @ b, b @ b
