@@ -355,6 +355,29 @@ def test_a_bias_of_all_sides_widens_the_distance_that_one_eye_tells():
     assert np.sqrt(unsure.covariance[5, 5]) < 0.8 / side * 1.5  # of a metre: both sides by 0.4 px of the width
 
 
+def test_a_lens_that_is_not_known_where_the_marker_is_widens_the_covariance():
+    X = facing(0.8, 0.3, 0.2, 0.3, -0.1, 0.05)
+    edges = edge_points(X, HEAD, MARKER, 0.05, np.random.default_rng(0))
+    edges = with_information(edges)
+    unknown = (
+        dc.replace(HEAD.left, sigma_px=((0.5, 0.5), (0.5, 0.5))),
+        dc.replace(HEAD.right, sigma_px=((0.5,) * 2,) * 2),
+    )
+    doubtful = dc.replace(HEAD, left=unknown[0], right=unknown[1])
+    for one in (edges, dc.replace(edges, right=QuadEdges(reason="not used"))):
+        sure, unsure = (estimate(one, head, MARKER, CONFIG, Track(X)) for head in (HEAD, doubtful))
+        assert (np.diag(unsure.covariance) > 25 * np.diag(sure.covariance)).all()
+
+
+def test_two_tilts_that_nothing_decides_between_are_both_within_the_covariance():
+    X, far = facing(3.0, 0.15, 0.05, 0.1), 0.0
+    for seed in range(20):
+        edges = edge_points(X, HEAD, MARKER, 0.3, np.random.default_rng(seed), cameras="left")
+        found = estimate(edges, HEAD, MARKER, CONFIG)
+        far = max(far, float((np.abs(pose_error(found.X_LV, X)) / np.sqrt(np.diag(found.covariance)))[:2].max()))
+    assert far < 4
+
+
 def test_covariance_is_honest_where_the_tilt_folds():
     """Seen frontally by one eye, a marker's tilt shows by its square: noise makes it seem tilted, and known for it."""
     X, rng = facing(2.5, 0.0, 0.0, 0.3), np.random.default_rng(4)
