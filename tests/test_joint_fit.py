@@ -77,7 +77,7 @@ def test_covariance_does_not_depend_on_the_blur_that_was_looked_for_first(monkey
     X, found = pose(1.2, 0.6), []
     image = canvas(X).finish(np.random.default_rng(3), 2.0)
     for blur in (0.65, 0.78, 0.95):
-        monkeypatch.setattr(line_fitting, "_SHARP", blur)
+        monkeypatch.setattr(line_fitting, "_START_BLUR", blur)
         found.append(np.linalg.inv(fit(image, X).information).diagonal())
     np.testing.assert_allclose(found, [found[1]] * 3, rtol=0.01)
 

@@ -2,7 +2,7 @@
 
 Red, or green, is the share of that opponent channel (R - (G + B) / 2) in the brightness: a shadow's edge hardly
 changes it. It is searched by LOCAL contrast against its mean over a small and a large neighbourhood, at half
-resolution. Absolute hues fail with the white balance; a mean over one neighbourhood alone fails on a marker larger.
+resolution. Absolute hues fail with the white balance; a single neighbourhood fails when the marker is larger than it.
 Every region is then cut out, halfway between its inside and its surroundings, and judged by shape:
 a convex quadrilateral with even surroundings. Nothing is dropped silently: a candidate carries the reason for its
 rejection.
@@ -19,11 +19,11 @@ from valve_drake.messages import CameraFrame, MarkerCandidate, Mode, Segmentatio
 from valve_drake.perception.marker import NEXT
 
 # Red, green and brightness of RGB; the offset stands for the noise that would else make colours of black.
-_MIX = np.array([[1, -0.5, -0.5, 0], [-0.5, 1, -0.5, 0], [1 / 3, 1 / 3, 1 / 3, 16]], np.float32)
+_OPPONENT_MIX = np.array([[1, -0.5, -0.5, 0], [-0.5, 1, -0.5, 0], [1 / 3, 1 / 3, 1 / 3, 16]], np.float32)
 _COLORS = {"red": 0, "green": 1}
-_LARGE = 100  # a region of this size is cut out at half resolution [px]
-_SQUARE = np.ones((3, 3), np.uint8)
-_COARSE = 4  # neighbourhoods are averaged at this part of the half resolution
+_HALF_RESOLUTION_SIZE = 100  # regions from this size on are cut out at half resolution; raise it for precision [px]
+_KERNEL_3X3 = np.ones((3, 3), np.uint8)
+_MEAN_STEP = 4  # neighbourhood means are computed at the half resolution divided by this
 
 
 _EVERY = {"search": 1, "measure": 1, "verify": 2}
@@ -175,25 +175,25 @@ class _Half:
 
 def _shares(image: np.ndarray) -> dict[str, np.ndarray]:
     """The shares of red and of green in the light of an image (H, W, 3) uint8, none below 0; (H, W) uint8 [%]."""
-    *colors, light = cv2.split(cv2.transform(image, _MIX))
+    *colors, light = cv2.split(cv2.transform(image, _OPPONENT_MIX))
     return {name: cv2.divide(color, light, scale=100) for name, color in zip(_COLORS, colors)}
 
 
 def _contrast(share: np.ndarray, config: RegionConfig) -> np.ndarray:
     """Largest excess of a colour's share over its means in both neighbourhoods; uint8.
 
-    Less of it than usual in the image does not count: grey beside green is not red under a warm light.
+    The background is at least the image's median share: else grey next to green would count as red under warm light.
     """
     size = share.shape[::-1]
     small = share
-    for part in (2, _COARSE):  # halves of halves are means of 4 x 4 as well, and sooner had
+    for part in (2, _MEAN_STEP):  # two 2 x 2 reductions equal one of 4 x 4 and are faster
         small = cv2.resize(small, [max(n // part, 1) for n in size], interpolation=cv2.INTER_AREA)
     some = small[::2, ::2].ravel()
     small = cv2.max(small, float(np.partition(some, len(some) // 2)[len(some) // 2]))
     means = []
     for box in (config.small_box, config.large_box):
         # A neighbourhood larger than the image would read past its reflection.
-        side = min((box // (2 * _COARSE)) | 1, 2 * min(small.shape) - 1)
+        side = min((box // (2 * _MEAN_STEP)) | 1, 2 * min(small.shape) - 1)
         means.append(cv2.blur(small, (side, side), borderType=cv2.BORDER_REFLECT))
     mean = cv2.resize(cv2.min(*means), size, interpolation=cv2.INTER_LINEAR)
     return cv2.blur(cv2.subtract(share, mean), (3, 3))
@@ -266,9 +266,9 @@ def _cut_out(
     strong = cv2.compare(local, 0.6 * float(local.max()), cv2.CMP_GT)
     inside = cv2.copyMakeBorder(strong, y - y0, y1 - y - h, x - x0, x1 - x - w, cv2.BORDER_CONSTANT, value=0)
     high = cv2.mean(share, inside)[0]
-    around = cv2.subtract(cv2.compare(share, high, cv2.CMP_LT), cv2.dilate(inside, _SQUARE))
+    around = cv2.subtract(cv2.compare(share, high, cv2.CMP_LT), cv2.dilate(inside, _KERNEL_3X3))
     halfway = (high + cv2.mean(share, around)[0]) / 2
-    step = 2 if 2 * max(w, h) > _LARGE else 1
+    step = 2 if 2 * max(w, h) > _HALF_RESOLUTION_SIZE else 1
     offset = np.array([half.origin[0] + 2 * x0, half.origin[1] + 2 * y0], float)
     if step == 1:
         u, v = offset.astype(int)
@@ -287,17 +287,17 @@ def _cut_out(
     # The ring begins outside the blur of the edge.
     region = np.zeros(mask.shape, np.uint8)
     cv2.drawContours(region, [seed], -1, 255, -1)
-    near = cv2.dilate(region, _SQUARE, iterations=2 // step)
-    ring = cv2.subtract(cv2.dilate(near, _SQUARE, iterations=2 // step), near)
+    near = cv2.dilate(region, _KERNEL_3X3, iterations=2 // step)
+    ring = cv2.subtract(cv2.dilate(near, _KERNEL_3X3, iterations=2 // step), near)
     ringed = cv2.countNonZero(ring)
     clear = ringed - cv2.countNonZero(cv2.bitwise_and(ring, mask))
-    core = cv2.erode(region, _SQUARE) if area > 100 else region
+    core = cv2.erode(region, _KERNEL_3X3) if area > 100 else region
     difference = np.subtract(cv2.mean(part, core), cv2.mean(part, ring))
     return Region(
         contour=step * contour + offset,
         center=step * center + offset,
         area=float(area) * step**2,
-        contrast=float(_MIX[_COLORS[color], :3] @ difference[:3]),
+        contrast=float(_OPPONENT_MIX[_COLORS[color], :3] @ difference[:3]),
         evenness=clear / ringed if ringed else 0.0,
     )
 

@@ -31,17 +31,17 @@ for _k in range(4):
 # Of the five functions of `gram`, by powers of tau: what the eight unknowns of a side and the residual are made of.
 _TERMS = Terms((0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2), (2, 3), (3, 0), (3, 1), (4, 0))
 _LEVELS, _BEND, _BLUR = slice(0, 4), 6, 7
-_LITTLE = 1e-9 * np.eye(7)
-_UNEVEN = 2.5  # chi^2 per degree of freedom by which the sides' levels may contradict common planes
+_RIDGE = 1e-9 * np.eye(7)
+_MAX_LEVEL_CHI2 = 2.5  # per degree of freedom, by which the sides' levels may contradict common planes of light
 _NODES, _ROWS = np.array(NODES), np.arange(8)  # of the nodes
 _WINDOW = 7  # half the square of pixels looked at round a corner [px]
-_SQUARE = np.mgrid[-_WINDOW : _WINDOW + 1, -_WINDOW : _WINDOW + 1][::-1].reshape(2, -1)  # its pixels (2, n)
-_OUTSIDE = 2.0  # of a side: pixels used at a corner [px]
-_SHORT = 2 * _WINDOW + 2  # sides below have no corner pixels of their own [px]
-_CUT = 4.5  # a pixel further from the model is not the marker's [sigma]
-_POOR = 2.5  # mean square of a corner's pixels above which it is covered or worn [sigma^2]
-_SHARPER = 0.5  # least share of the blur that one step may leave: further off the model is not linear
-_EVEN = (np.arange(16) + 0.5) / 8 - 1  # tau of the points on each side that stand for it
+_WINDOW_PIXELS = np.mgrid[-_WINDOW : _WINDOW + 1, -_WINDOW : _WINDOW + 1][::-1].reshape(2, -1)  # its pixels (2, n)
+_CORNER_MARGIN = 2.0  # of a side: pixels used at a corner [px]
+_MIN_CORNER_SIDE = 2 * _WINDOW + 2  # sides below have no corner pixels of their own [px]
+_MAX_PIXEL_SIGMAS = 4.5  # a pixel further from the model is not the marker's [sigma]
+_MAX_CORNER_CHI2 = 2.5  # mean square of a corner's pixels above which it is covered or worn [sigma^2]
+_MIN_BLUR_RATIO = 0.5  # least share of the blur that one step may leave: further off the model is not linear
+_EVEN_TAU = (np.arange(16) + 0.5) / 8 - 1  # tau of the points on each side that stand for it
 _ENDS, _ENDS_AND_MIDDLE = np.array([-1.0, 1.0]), np.array([-1.0, 0.0, 1.0])
 PRIOR_POINTS = 20  # how many points the noise of the grey values counts for, against the points' scatter
 
@@ -168,8 +168,8 @@ def joint_fit(
     apart = _apart(normal, seen.right)
     freedom = seen.pixels.reshape(Q, 4).sum(1) - 29
     variance = (seen.square.reshape(Q, 4).sum(1) + apart) / np.maximum(freedom, 1)
-    fits = (freedom >= 30) & (lost > apart) & (lost - apart < 10 * _UNEVEN * variance)
-    fits &= 1 + step[:, 18] / blur > _SHARPER
+    fits = (freedom >= 30) & (lost > apart) & (lost - apart < 10 * _MAX_LEVEL_CHI2 * variance)
+    fits &= 1 + step[:, 18] / blur > _MIN_BLUR_RATIO
 
     per_shift = (curves.inward / curves.cosine)[:, None]
 
@@ -179,7 +179,7 @@ def joint_fit(
     final = moved(step)
     ends = _corners(final)
     fits &= np.isfinite(ends).all((1, 2))
-    long = np.flatnonzero(fits & (((ends[:, NEXT] - ends) ** 2).sum(2).min(1) > _SHORT**2))
+    long = np.flatnonzero(fits & (((ends[:, NEXT] - ends) ** 2).sum(2).min(1) > _MIN_CORNER_SIDE**2))
     if len(long):
         light = planes + step[:, :6]
         J, r, owner = _corner_pixels(sheet, final, ends, light, blur + step[:, 18], (centre, size), variance, long)
@@ -195,10 +195,10 @@ def joint_fit(
     t = begin[:, None] + (stop - begin)[:, None] * _NODES
     K = np.zeros((Q, 8, 19))  # undistorted, none has a bend
     K[:, _ROWS, _ROWS // 2 * 3 + 6], K[:, _ROWS, _ROWS // 2 * 3 + 7] = 1, final.tau(t).reshape(Q, 8)
-    even = final.points(_EVEN)
+    even = final.points(_EVEN_TAU)
     # What pixels know of an edge's place goes with the inverse of its blur, and H is of the blur before the step.
     wider = 1 + step[:, 18] / blur
-    fits &= wider > _SHARPER
+    fits &= wider > _MIN_BLUR_RATIO
     chi2, n = scatter.T
     noise = wider * (chi2 + PRIOR_POINTS * variance) / (n + PRIOR_POINTS)
     out: list[tuple[np.ndarray, np.ndarray] | None] = [None] * Q
@@ -217,7 +217,7 @@ def _apart(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
     """
     both = np.empty((len(right), 7, 2))
     both[:, :, 0], both[:, :, 1] = right[:, :7], normal[:, :7, _BLUR]
-    products = both.transpose(0, 2, 1) @ np.linalg.solve(normal[:, :7, :7] + _LITTLE, both)
+    products = both.transpose(0, 2, 1) @ np.linalg.solve(normal[:, :7, :7] + _RIDGE, both)
     fall = products[:, 0, 0].reshape(-1, 4).sum(1)
     g = (right[:, _BLUR] - products[:, 1, 0]).reshape(-1, 4).sum(1)
     h = (normal[:, _BLUR, _BLUR] - products[:, 1, 1]).reshape(-1, 4).sum(1)
@@ -262,7 +262,7 @@ def _corner_pixels(
     corners = (4 * quads[:, None] + _FOUR).ravel()  # numbers among all 4 Q
     before = (4 * quads[:, None] + _BEFORE).ravel()
     C = len(corners)
-    u, v = np.rint(ends.reshape(-1, 2)[corners]).astype(int).T[:, :, None] + _SQUARE[:, None]  # (C, n)
+    u, v = np.rint(ends.reshape(-1, 2)[corners]).astype(int).T[:, :, None] + _WINDOW_PIXELS[:, None]  # (C, n)
     sides = curves[np.concatenate([corners, before])]  # those that begin at the corners, then those that end there
     flat, first = sides.flat.reshape(2, C, 1), sides.first[:, None]
     t, y = (np.where(flat, *both).reshape(2 * C, -1) for both in ((u, v), (v, u)))
@@ -273,7 +273,7 @@ def _corner_pixels(
     of = corners // 4
     (low_u, low_v), (high_u, high_v) = sheet.low[of].T[:, :, None], sheet.high[of].T[:, :, None]
     keep = (u >= low_u) & (v >= low_v) & (u <= high_u) & (v <= high_v)
-    keep &= beyond[:C] & beyond[C:] & (near > -_OUTSIDE) & (far > -1) & (near < 4)
+    keep &= beyond[:C] & beyond[C:] & (near > -_CORNER_MARGIN) & (far > -1) & (near < 4)
     kept = np.flatnonzero(keep)
     row = kept // u.shape[1]
     corner, behind = corners[row], before[row]
@@ -304,10 +304,10 @@ def _corner_pixels(
     value = sheet.pixels[v, u]
     r = value - (place * light[:, :3]).sum(1) - height * cover
     chi2 = r * r / variance[q]
-    good = chi2 < _CUT**2
+    good = chi2 < _MAX_PIXEL_SIGMAS**2
     used = np.bincount(row, good, C)
     mean = np.bincount(row, good * chi2, C) / np.maximum(used, 1)
-    good &= ((mean < _POOR) & (used > 0.9 * np.bincount(row, minlength=C)))[row]
+    good &= ((mean < _MAX_CORNER_CHI2) & (used > 0.9 * np.bincount(row, minlength=C)))[row]
     return J[good], r[good], q[good]
 
 

@@ -35,20 +35,20 @@ _LEVEL_PRIOR = np.diag([1e-9, 0.1, 1e-9, 0.1, 1e-6, 1e-6])
 _CURVE_PRIOR, _BEND = np.diag([1e-9, 1e-9, 0.0]), np.diag([0.0, 0.0, 1.0])
 _FOUR = np.arange(4)
 _ALONG = (np.arange(12) + 0.5) / 12  # of a side's length: where light beside it is looked at
-_REACH = 4.5  # half a profile's length that holds a blurred step [blur]
-_PAD = 12  # least room round the quadrilateral [px]
-_LARGE = 100  # of a quadrilateral of this size colours and coarse lines are looked for at half resolution [px]
-_EVEN = 0.1  # deviation over mean of the marker's inside above which a shadow is looked for
-_ONE_HUE = 0.96  # least cosine between the marker's colour in the shadow and in the light
-_TWO_LEVELS = 0.25  # share of that variance which two lights leave unexplained at most
-_LEAST_HALF = 2  # half a profile's length at a side's ends, where the light plate is narrowest [px] ...
-_LEAN = 2.5  # ... and the pixels along the side that it needs for one more
-_ENOUGH = 30  # profiles of a side that find the way to its edge
-_GROWN = np.array([0.75, 1.14, 1.3])  # the marker's inside, and a ring of its surroundings, over its size
+_STEP_REACH = 4.5  # a profile must extend this far on either side to hold a blurred step [blur]
+_MIN_PADDING = 12  # of a cut-out round its quadrilateral [px]
+_HALF_RESOLUTION_SIZE = 100  # from this size on colours and coarse lines come from half the resolution [px]
+_SHADOW_DEVIATION = 0.1  # deviation over mean of the marker's inside above which a shadow is looked for
+_MIN_HUE_COSINE = 0.96  # between the marker's colour in the shadow and in the light; lower: something covers it
+_MAX_UNEXPLAINED = 0.25  # share of that variance that two levels of light may leave
+_MIN_HALF_WINDOW = 2  # of a profile at a side's ends, where the light plate is narrowest [px]
+_PIXELS_PER_STEP = 2.5  # the half window grows by one pixel every 2.5 px away from a corner
+_COARSE_PROFILES = 30  # long sides are subsampled to this many until the last iteration
+_MASK_SCALES = np.array([0.75, 1.14, 1.3])  # of the marker's outline: its inside, and both rims of a ring round it
 _DARK, _BRIGHT = 2, 253  # a value up to the one, or from the other on, may be clipped
 _CLIPPED_SHARE = 0.05  # of the pixels beside the sides that are clipped, from which a colour channel is left out
 _CLIPPED_BIAS = 0.6  # error of a side whose level is clipped, the same way on all sides [blur]
-_SHARP = 0.8  # blur that is looked for first: a lens in focus, and the pixel itself [px]
+_START_BLUR = 0.8  # of the fit: a lens in focus, and the pixel itself [px]
 
 
 @dc.dataclass
@@ -176,7 +176,7 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
     parts = []
     for k, (image, start) in enumerate(zip(images, corners)):
         least, most = start.min(0), start.max(0)
-        pad = max(_PAD, int(0.1 * (most - least).max()))  # the ring that `_mix` looks at grows with the marker
+        pad = max(_MIN_PADDING, int(0.1 * (most - least).max()))  # the ring that `_mix` looks at grows with the marker
         low = np.maximum(np.floor(least).astype(int) - pad, 0)
         high = np.minimum(np.ceil(most).astype(int) + pad + 1, [image.shape[1], image.shape[0]])
         if (high - low < 6).any():
@@ -197,10 +197,10 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
     fitted = iter(_fit_each(sheet[own], sides[own], config) if fits.any() else ())
     for q, k in enumerate(number):
         raw = next(fitted) if fits[q] else RawQuad(reason=reasons[q])
-        if int(_REACH * raw.blur) > sides.half[q]:
+        if int(_STEP_REACH * raw.blur) > sides.half[q]:
             # A step that reaches beyond its profiles is fitted once more, to longer ones.
             one = slice(q, q + 1)
-            wide, (reason,) = _place(sheet[one], coarse[one], config, _REACH * raw.blur)
+            wide, (reason,) = _place(sheet[one], coarse[one], config, _STEP_REACH * raw.blur)
             if not reason and wide.half[0] > sides.half[q]:
                 raw = _fit_each(sheet[one], wide, config)[0]
         if not raw.reason:
@@ -208,7 +208,7 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
             together = None if raw.together is None else raw.together + back
             raw = dc.replace(raw, points=raw.points + back, together=together)
             if clipped[q].any():
-                raw = dc.replace(raw, bias=_CLIPPED_BIAS * max(raw.blur, _SHARP) * clipped[q])
+                raw = dc.replace(raw, bias=_CLIPPED_BIAS * max(raw.blur, _START_BLUR) * clipped[q])
         out[k] = raw
     return out
 
@@ -246,13 +246,13 @@ def _mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np
     A colour whose light is clipped takes no part if the others have contrast enough.
     """
     clipped = _clipped(part, corners)
-    step = 2 if (corners.max(0) - corners.min(0)).max() > _LARGE else 1
+    step = 2 if (corners.max(0) - corners.min(0)).max() > _HALF_RESOLUTION_SIZE else 1
     small, corners = _every(part, step), corners / step
     if config.gamma != 1.0:
         table = (255 * (np.arange(256) / 255) ** config.gamma).astype(np.float32)
         part, small = cv2.LUT(part, table), cv2.LUT(small, table)
     middle = corners.sum(0) / 4
-    grown = ((middle + _GROWN[:, None, None] * (corners - middle)) * 16 + 0.5).astype(np.int32)
+    grown = ((middle + _MASK_SCALES[:, None, None] * (corners - middle)) * 16 + 0.5).astype(np.int32)
     inside, near, far = (cv2.fillConvexPoly(np.zeros(small.shape[:2], np.uint8), c, 255, shift=4) for c in grown)
     part, small = _even_light(part, small, inside, step)
     core = np.array(cv2.mean(small, inside)[:3])
@@ -304,7 +304,7 @@ def _even_light(part: np.ndarray, small: np.ndarray, inside: np.ndarray, step: i
     beyond the marker.
     """
     mean, deviation = (x.ravel() for x in cv2.meanStdDev(small, mask=inside))
-    if deviation.max() < _EVEN * mean.max():
+    if deviation.max() < _SHADOW_DEVIATION * mean.max():
         return part, small
     v, u = np.nonzero(inside)
     colors = small[v, u].astype(float)
@@ -330,11 +330,11 @@ def _even_light(part: np.ndarray, small: np.ndarray, inside: np.ndarray, step: i
         else:
             damping *= 10
         x = best + np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), g)
-    if square > _TWO_LEVELS * len(y) * y.var():
+    if square > _MAX_UNEXPLAINED * len(y) * y.var():
         return part, small
     levels = np.linalg.lstsq(np.column_stack([form[:, 2], np.tanh(form @ best[:3])]), colors, rcond=None)[0]
     one, other = levels[0] + levels[1], levels[0] - levels[1]
-    if one @ other < _ONE_HUE * np.linalg.norm(one) * np.linalg.norm(other):
+    if one @ other < _MIN_HUE_COSINE * np.linalg.norm(one) * np.linalg.norm(other):
         return part, small  # something lies before the marker
     rows, columns = (np.arange(n)[shape] for n, shape in zip(part.shape, ((..., None), (None, ...))))
     s = np.tanh(((columns - middle[0]) * best[0] + (rows - middle[1]) * best[1]) / size + best[2])
@@ -349,7 +349,7 @@ def _hough_corners(sheet: Sheet, corners: np.ndarray) -> np.ndarray:
     A side without such a line (a wide-angle lens bends long ones) starts from its coarse one.
     """
     Q = len(corners)
-    step = 2 if (corners.max(1) - corners.min(1)).max(1).min() > _LARGE else 1
+    step = 2 if (corners.max(1) - corners.min(1)).max(1).min() > _HALF_RESOLUTION_SIZE else 1
     coarse, corners = corners, corners / step
     gray = cv2.convertScaleAbs(cv2.max(_every(sheet.pixels, step), 0.0), alpha=255)
     edges = cv2.Canny(gray, 60, 120)
@@ -438,7 +438,7 @@ def _place(sheet: Sheet, corners: np.ndarray, config: SidesConfig, least: float 
     width = np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]) / 2 / np.maximum(lengths.max(1), 1e-9)
     half = np.minimum(np.maximum(np.rint(config.reach * width), 3), config.half_window)
     half = np.maximum(half, np.minimum(least, 0.3 * width)).astype(int)
-    reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 3.0)) + _LEAST_HALF * np.abs(slope) * cosine
+    reach = np.maximum(config.trim, np.minimum(0.15 * lengths, 3.0)) + _MIN_HALF_WINDOW * np.abs(slope) * cosine
     reach *= cosine
     (low_t, _), (high_t, _) = by_side(sheet.low[:, None]), by_side(sheet.high[:, None])
     first = np.maximum(np.ceil(np.minimum(begin_t, end_t) + reach), low_t).astype(int)
@@ -525,7 +525,7 @@ def _follow(sheet: Sheet, sides: _Sides, config: SidesConfig) -> _Followed:
     from_end = np.minimum(k, count[:, None] - 1 - k)
     all_used = (from_end >= 0).astype(float)
     all_tau = 2 * k / (count[:, None] - 1.0) - 1  # -1..1
-    rooms = all_used * (half + 1 - np.maximum(half - _LEAST_HALF - from_end / _LEAN, 0))
+    rooms = all_used * (half + 1 - np.maximum(half - _MIN_HALF_WINDOW - from_end / _PIXELS_PER_STEP, 0))
     lines = start[:, None] + slope[:, None] * all_t
     all_powers = basis(all_tau)
 
@@ -544,11 +544,11 @@ def _follow(sheet: Sheet, sides: _Sides, config: SidesConfig) -> _Followed:
         return np.repeat(values.reshape(Q, -1).sum(1), 4)
 
     # On long sides the way there is found with some of the profiles, and the last step is made with all of them.
-    stride = max(int(count.min()) // _ENOUGH, 1)
+    stride = max(int(count.min()) // _COARSE_PROFILES, 1)
     coefficient = np.zeros((len(count), 3))  # of the sides' deviation from their first straight lines
     used, tau, room, line, middle, functions, powers = profiles(stride)
     bend = np.where(count >= 24, 1e-9, 1e9)  # short sides show no curvature of the lens
-    good, blur, last = used, np.full(len(count), _SHARP), False
+    good, blur, last = used, np.full(len(count), _START_BLUR), False
     has_step = np.full(len(count), True)
     for iteration in range(config.iterations):
         if last and stride > 1:

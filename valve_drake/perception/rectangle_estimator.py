@@ -42,7 +42,7 @@ _CONTRADICTED = 12.0  # fall of chi^2 by another right camera from which the hea
 _OTHER_CAMERA = np.array([0.02, 0.02, 0.02, 0.03, 0.03])  # prior on it: its turn [rad], its magnifications [relative]
 _UNEVEN_BIAS = 0.1  # part of a side's `QuadEdges.bias` in which it differs from the other sides
 _LEAST_WEIGHT = 0.5  # share of a side's own weight below which the joint fit may not push it
-_SHORT_SIDE = 40.0  # blur and surroundings bias shorter sides more [px]
+_SHORT_SIDE = 40.0  # sides below are biased more by blur and by what surrounds them [px]
 _FOUR, _EYE, _NODES = np.arange(4), np.eye(8), np.array(NODES)[:, None]
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 _SKEW = np.zeros((3, 9))  # v @ _SKEW is [v]x row by row
@@ -325,7 +325,7 @@ def _robust_lines(
     trust = np.ones(len(side))
     lines, scatter = side_lines(points, side)
     if config.loss != "none" and scatter > 1.5 * sigma:
-        for _ in range(5):  # least absolute distances stand outliers, then a cut at their own scale
+        for _ in range(5):  # L1 reweighting tolerates outliers; then a cut at the points' own scale
             off = np.abs((lines[side, :2] * points).sum(1) + lines[side, 2])
             lines = _weighted_lines(points, side, 1 / np.maximum(off, sigma))
         off = np.abs((lines[side, :2] * points).sum(1) + lines[side, 2])
@@ -621,7 +621,7 @@ def _candidates(
         if len(fits) == 1 and not pruned:
             pruned = [(_moved_to_fit(moments, model, *mirrored), mirrored[0])]
     if len(fits) == 1 and math.isfinite(pruned[0][0]):
-        # The other tilt itself, moved to fit, stands for a minimum that it may not have.
+        # If the mirrored tilt has no minimum of its own, its best translation is the alternative.
         cost, R = pruned[0]
         fits.append(dc.replace(fits[0], R=R, cost=max(cost, fits[0].cost), at=None))
     return fits
