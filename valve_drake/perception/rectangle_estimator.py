@@ -113,7 +113,6 @@ class _View:
     scale: np.ndarray  # (4,) px of the raw image per unit of distance from each side in the ideal one
     sigma: float  # [px]
     bias: np.ndarray  # (4,) of the sides, all inward or all outward [px]
-    lens_sigma: np.ndarray  # (4,) of the sides, each for itself: where the lens was not calibrated [px]
     lines: np.ndarray  # (4, 3)
     corners: np.ndarray  # (4, 2)
     green: np.ndarray  # (m, 2)
@@ -287,8 +286,7 @@ def _view(
         return "sides do not make a convex quadrilateral in clockwise order"
     # Errors are even in the raw image, not in the ideal one: |A^T n| with A = d xy / d px along the side's normal.
     # It changes by a few percent over an image, so one value for each side will do.
-    middles = (quad.corners_px + quad.corners_px[NEXT]) / 2
-    A = lens.normalize_jacobian(middles)
+    A = lens.normalize_jacobian((quad.corners_px + quad.corners_px[NEXT]) / 2)
     stretch = np.linalg.norm((lines[:, None, :2] @ A)[:, 0], axis=1)
     return _View(
         X_CL=X_CL,
@@ -299,7 +297,6 @@ def _view(
         scale=1 / stretch,
         sigma=sigma,
         bias=quad.bias,
-        lens_sigma=lens.sigma(middles),
         lines=lines,
         corners=corners,
         green=quad.green,
@@ -362,8 +359,8 @@ def _aligned(left: _View, right: _View) -> _View:
     turn = turn_between(left.corners, right.corners)
     if turn == 0:
         return right
-    by_side = (right.lines, right.corners, right.scale, right.bias, right.lens_sigma)
-    lines, corners, scale, bias, lens_sigma = (values[(_FOUR + turn) % 4] for values in by_side)
+    by_side = (right.lines, right.corners, right.scale, right.bias)
+    lines, corners, scale, bias = (values[(_FOUR + turn) % 4] for values in by_side)
     nodes = (np.arange(8) + 2 * turn) % 8
     information = right.information[np.ix_(nodes, nodes)]
     return dc.replace(
@@ -371,7 +368,6 @@ def _aligned(left: _View, right: _View) -> _View:
         side=(right.side - turn) % 4,
         scale=scale,
         bias=bias,
-        lens_sigma=lens_sigma,
         lines=lines,
         corners=corners,
         information=information,
@@ -386,8 +382,8 @@ def _moments(views: list[_View], weights: list[np.ndarray], config: RectangleEst
     lengths = np.sqrt((along * along).sum(2)) * np.array([[view.focal] for view in views])
     # A side is not better known than its common bias, however many points it has.
     biases = config.side_bias * np.minimum(np.maximum((_SHORT_SIDE / lengths) ** 3, 1), 10)
-    if any(view.bias.any() or view.lens_sigma.any() for view in views):
-        biases = np.hypot(biases, [np.hypot(_UNEVEN_BIAS * view.bias, view.lens_sigma) for view in views])
+    if any(view.bias.any() for view in views):
+        biases = np.hypot(biases, [_UNEVEN_BIAS * view.bias for view in views])
     told = [k for k, view in enumerate(views) if view.information.any()]
     if told:
         # Two nodes make a side: each has twice the variance of the bias.
@@ -864,7 +860,7 @@ def _paper(
         for k in range(4):
             normal = view.lines[k, :2]
             along = np.array([normal[1], -normal[0]])
-            offset = 1 / math.sqrt(total[k]) + config.side_bias / view.focal + view.lens_sigma[k] / view.scale[k]
+            offset = 1 / math.sqrt(total[k]) + config.side_bias / view.focal
             angle = 1 / math.sqrt(max(along @ S[k] @ along, 1e-300))
             for change in ((0.0, offset), (angle, 0.0)):
                 turned = normal + change[0] * along

@@ -183,9 +183,9 @@ def wrong_size(
 
 
 def epipolar_offset(left: np.ndarray, right: np.ndarray, X_LR: np.ndarray) -> np.ndarray:
-    """By how much the middle of right corners (4, 2) is off the epipolar line of the left ones', all ideal: (2,) in
-    the right image."""
-    a, b = (np.append(corners.mean(0), 1.0) for corners in (left, right))
+    """By how much the rectangle's centre in the right image is off the epipolar line of that in the left one: (2,) in
+    the right ideal image. left, right: (4, 2) ideal corners."""
+    a, b = (np.append(middle(corners), 1.0) for corners in (left, right))
     line = X_LR[:, :3].T @ frames.cross(X_LR[:, 3], a)
     return line[:2] * (line @ b) / max(line[:2] @ line[:2], 1e-300)
 
