@@ -166,7 +166,8 @@ def test_pure_noise_is_given_up_without_the_search_that_takes_minutes(monkeypatc
 
 def test_a_defocused_board_is_refined_with_a_window_that_holds_its_blurred_edges():
     X_CT = frames.make(frames.rotation(np.array([0.3, -0.25, 0.2])), np.array([0.02, 0.0, 0.3]))
-    image = cv2.GaussianBlur(boards.draw(PAPER, X_CT, BOARD, 2), (0, 0), 3.0)
+    image = cv2.GaussianBlur(boards.draw(PAPER, X_CT, BOARD, 2), (0, 0), 4.0).astype(float)
+    image = (image + np.random.default_rng(6).normal(0, 1, image.shape)).clip(0, 255).round().astype(np.uint8)
     error = find_corners(image, BOARD) - boards.corners(PAPER, X_CT, BOARD.points())
     assert np.sqrt((error**2).sum(1).mean()) < 0.1
 
@@ -331,6 +332,23 @@ def test_terms_that_the_corners_determine_are_fitted():
     true = OpenCvLens(OPENCV.K, [-0.2, 0.08, 2e-3, -1e-3, 0])
     result = cal.calibrate(views((true,), poses, 0.05, 54), SIZE)
     assert {"k1", "k2", "p1", "p2"} <= set(result.fit.names) and np.abs(deviations(result.fit, (true,))).max() < 4
+
+
+def test_terms_by_which_the_lens_would_fold_back_inside_its_image_are_not_taken(monkeypatch):
+    seen = views((OpenCvLens(OPENCV.K, [-0.12, 0.05, 0, 0, 0]),), in_the_middle(OPENCV), 0.1, 52)
+    monkeypatch.setattr(cal, "_TERMS", ((0, 1, 4), (0, 1)))
+    reach, fits = OpenCvLens.radial_reach, []
+
+    def folded(lens: OpenCvLens) -> tuple[float, float]:
+        fits.append(lens.dist[4] != 0)
+        return (100.0, 400.0) if lens.dist[4] else reach(lens)
+
+    monkeypatch.setattr(OpenCvLens, "radial_reach", folded)
+    monkeypatch.setattr(cal, "_criterion", lambda fit, more, parameters: -parameters)  # most terms first
+    assert cal.calibrate(seen, SIZE).fit.lenses[0].dist[4] == 0 and fits[0]
+    monkeypatch.setattr(OpenCvLens, "radial_reach", lambda lens: (100.0, 400.0))
+    with pytest.raises(ConfigError, match="folds back inside the image"):
+        cal.calibrate(seen, SIZE)
 
 
 def test_boards_of_a_fisheye_are_named_as_such():
