@@ -1,6 +1,10 @@
 """camera_workers: the same images as the rig's, made in other processes and begun ahead."""
 
 import gc
+import os
+import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -86,3 +90,35 @@ def test_the_processes_end_with_the_block_and_a_lost_one_is_named(rig, rig_argum
             workers.frame("head_left", captures(rig, 1)[0])
     assert all(process.poll() is not None for process in processes)
     gc.collect()  # what is left of a failed call must not take the program with it
+
+
+FORKED = """
+import pickle, sys, threading, warnings
+from valve_drake.stations.camera_workers import CameraWorkers
+warnings.simplefilter("error")  # of a fork beside threads
+rig, capture, beside = pickle.load(sys.stdin.buffer)
+threads = [threading.Thread(target=threading.Event().wait, daemon=True) for _ in range(beside)]
+for thread in threads:
+    thread.start()
+with CameraWorkers() as workers:
+    workers.start(*rig)
+    data = workers.frame("head_right", capture).data
+    kinds = [type(worker.process).__name__ for worker in workers._workers]
+sys.stdout.buffer.write(pickle.dumps((kinds, data)))
+"""
+
+
+@pytest.mark.parametrize("threads", [0, 1])
+def test_a_process_without_threads_is_forked_and_any_other_starts_new_ones(rig, rig_arguments, threads):
+    capture = captures(rig, 1)[0]
+    result = subprocess.run(
+        [sys.executable, "-c", FORKED],
+        input=pickle.dumps((rig_arguments, capture, threads)),
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True,
+        check=True,
+    )
+    kinds, data = pickle.loads(result.stdout)
+    assert kinds == 2 * (["Popen"] if threads else ["ForkProcess"])
+    assert data == rig.frame("head_right", capture).data
+    assert result.stderr == b""

@@ -46,6 +46,8 @@ COMMANDS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command -> exit code."""
+    # Of BLAS, that no matrix here is large enough for: a process with one thread can be forked (camera_workers.py).
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.getLogger("drake").addFilter(_is_warning)  # its news would stand between the program's lines
     logging.getLogger("valve_drake").addHandler(logging.NullHandler())  # the commands say it themselves
     with _terminal() as output:

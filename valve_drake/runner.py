@@ -176,12 +176,17 @@ def run(
     cv2.setNumThreads(1)  # the same bits on any machine, and the renderer wants the cores
     if scenario.station == "hardware":
         recording = meshcat = False  # 3D views exist in simulation only
-        link = link or RobotLink(Bus(scenario.hardware), stop=stop)
-    view = _make_view(say if meshcat else None) if recording or meshcat else None
     profile.clear()
-    writer = LogWriter(log, companions=(".json", ".html") if recording else (".json",), overwrite=overwrite)
     troubles = []
-    with _log_kept(writer), CameraWorkers() as workers:
+    with contextlib.ExitStack() as stack:
+        workers = None
+        if scenario.station == "hardware":
+            link = link or RobotLink(Bus(scenario.hardware), stop=stop)
+        else:
+            workers = stack.enter_context(CameraWorkers())  # before view and writer, which start threads
+        view = _make_view(say if meshcat else None) if recording or meshcat else None
+        writer = LogWriter(log, companions=(".json", ".html") if recording else (".json",), overwrite=overwrite)
+        stack.enter_context(_log_kept(writer))
         if writer.note:
             say(writer.note)
         _begin_log(writer, scenario, files)

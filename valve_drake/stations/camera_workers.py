@@ -8,7 +8,9 @@ does: the same bits as `CameraRig.frame`, sooner. A wrong guess costs time and c
 import collections
 import contextlib
 import dataclasses as dc
+import gc
 import multiprocessing.connection
+import multiprocessing.context
 import os
 import pickle
 import signal
@@ -16,7 +18,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import cv2
@@ -25,21 +27,28 @@ import numpy as np
 from valve_drake.checks import OperationFailed
 from valve_drake.messages import CameraFrame
 from valve_drake.ports import profile
+from valve_drake.stations import render_egl
 from valve_drake.stations.camera_rig import CameraRig, Capture
 from valve_drake.stations.contract import CAMERAS, HEAD, MATE, WRISTS
 
 WORKERS = 2
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # that the program answers in its own way
 KEPT = 8  # captures of a camera that may still be asked for
 
 
 @dc.dataclass
 class _Worker:
-    process: subprocess.Popen[bytes]
+    process: "subprocess.Popen[bytes] | multiprocessing.context.ForkProcess"
+    wait: Callable[[], int]  # until it has ended -> its exit code, or minus the signal that ended it
     wire: multiprocessing.connection.Connection
 
 
 class CameraWorkers:
-    """Makes images in other processes while open; `start` says of what. Use: `with CameraWorkers() as workers:`."""
+    """Makes images in other processes while open; `start` says of what. Use: `with CameraWorkers() as workers:`.
+
+    A process with one thread is forked, which spares each worker the imports; one with more cannot be forked safely,
+    and starts new ones. So it is cheapest to enter before anything that keeps a thread.
+    """
 
     def __init__(self) -> None:
         self._workers: list[_Worker] = []
@@ -49,6 +58,13 @@ class CameraWorkers:
         self._read: dict[str, tuple[int, int]] = {}  # sequence read last, and how many captures after the one before
 
     def __enter__(self) -> "CameraWorkers":
+        start = _fork if _can_fork() else _spawn
+        for _ in range(WORKERS):
+            here, there = socket.socketpair()
+            wire = multiprocessing.connection.Connection(here.detach())
+            with there:
+                mine = [*(worker.wire for worker in self._workers), wire]
+                self._workers.append(_Worker(*start(there.fileno(), mine), wire))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -56,23 +72,14 @@ class CameraWorkers:
             worker.wire.close()
             worker.process.terminate()  # the closed wire would end it, but only after the image that it makes
         for worker in self._workers:
-            worker.process.wait()
+            worker.wait()
         self._workers = []
 
     def start(self, *rig: object) -> "CameraWorkers":
-        """Starts the processes. rig: the arguments of CameraRig."""
-        for _ in range(WORKERS):
-            here, there = socket.socketpair()
-            with there:
-                code = f"from valve_drake.stations.camera_workers import serve; serve({there.fileno()})"
-                process = subprocess.Popen(
-                    [sys.executable, "-c", code],
-                    pass_fds=[there.fileno()],
-                    start_new_session=True,  # a terminal's signals are for the run, which decides when this ends
-                )
-            worker = _Worker(process, multiprocessing.connection.Connection(here.detach()))
-            _send(worker.wire, rig)
-            self._workers.append(worker)
+        """Tells the processes what to make images of. rig: the arguments of CameraRig."""
+        for worker in self._workers:
+            with contextlib.suppress(OSError):  # one that has ended is named when it is asked for an image
+                _send(worker.wire, rig)
         return self
 
     def captured(self, name: str, capture: Capture) -> None:
@@ -134,7 +141,7 @@ class CameraWorkers:
         try:
             yield worker.wire
         except (EOFError, OSError) as error:
-            code = worker.process.wait()
+            code = worker.wait()
             raise OperationFailed(f"the process that renders {name} ended with code {code}") from error
 
 
@@ -145,6 +152,56 @@ def _send(wire: multiprocessing.connection.Connection, thing: Any) -> None:
 
 def _recv(wire: multiprocessing.connection.Connection) -> Any:
     return pickle.loads(wire.recv_bytes())
+
+
+def _can_fork() -> bool:
+    """Whether a copy of this process would work: without threads, and without OpenGL, that is no copy of its own."""
+    try:
+        return len(os.listdir("/proc/self/task")) == 1 and not render_egl.is_open()
+    except OSError:  # no Linux
+        return False
+
+
+def _fork(
+    fd: int, mine: Sequence[multiprocessing.connection.Connection]
+) -> tuple[multiprocessing.context.ForkProcess, Callable[[], int]]:
+    """A copy of this process serves `fd`; mine: wires of this process, that the copy must not keep open."""
+    process = multiprocessing.context.ForkProcess(target=_serve_copy, args=(fd, mine), daemon=True)
+    old = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until the copy has put away the program's answers
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, old)
+
+    def wait() -> int:
+        process.join()
+        return process.exitcode or 0
+
+    return process, wait
+
+
+def _serve_copy(fd: int, mine: Sequence[multiprocessing.connection.Connection]) -> None:
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    for wire in mine:
+        wire.close()
+    os.setsid()
+    gc.freeze()  # what was copied stays shared
+    serve(fd)
+
+
+def _spawn(
+    fd: int, mine: Sequence[multiprocessing.connection.Connection]
+) -> tuple[subprocess.Popen[bytes], Callable[[], int]]:
+    """A new process serves `fd`."""
+    code = f"from valve_drake.stations.camera_workers import serve; serve({fd})"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        pass_fds=[fd],
+        start_new_session=True,  # a terminal's signals are for the run, which decides when this ends
+    )
+    return process, process.wait
 
 
 def serve(fd: int) -> None:

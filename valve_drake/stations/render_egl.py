@@ -268,6 +268,11 @@ class _OpenGL:
 _opened: list[_OpenGL] = []  # the newest last: an engine shares it with all others
 
 
+def is_open() -> bool:
+    """Whether this process has opened OpenGL: a copy of it (fork) could not use it."""
+    return bool(_opened)
+
+
 def _open() -> _OpenGL:
     """The process's OpenGL: to open one takes longer than an image."""
     if not _opened or not _opened[-1].alive():
