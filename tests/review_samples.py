@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 
-from valve_drake.analysis.integrity import BEHAVIORS
 from valve_drake.frames import compose, inverse, make, planar, rot_y, rot_z, rotation
 from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import (
@@ -28,7 +27,7 @@ from valve_drake.messages import (
 )
 from valve_drake.recording import foxglove
 from valve_drake.recording.schemas import Vector, Wrench
-from valve_drake.recording.signals import TORSO, TRUTH
+from valve_drake.recording.signals import BEHAVIORS, TORSO, TRUTH
 from valve_drake.recording.writer import LogWriter
 
 TICK = 1 / 128

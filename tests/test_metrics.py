@@ -233,10 +233,10 @@ def test_messages_lost_from_the_file_are_counted_by_their_numbers(path, tmp_path
 
 def test_a_steady_block_is_held_to_its_own_rate(tmp_path):
     def change(topic, message, t):
-        slow = topic == "/base_approach/command" and round(t * 128) % 2
-        return None if slow or (topic == "/base_approach/command" and 0.5 <= t < 0.75) else message
+        slow = topic == "/valve_search/command" and round(t * 128) % 2
+        return None if slow or (topic == "/valve_search/command" and 0.5 <= t < 0.75) else message
 
-    row = rows(sample.write_run(tmp_path / "slow.mcap", end=2.0, change=change))["/base_approach/command"]
+    row = rows(sample.write_run(tmp_path / "slow.mcap", end=2.0, change=change))["/valve_search/command"]
     assert row.period_s == 1 / 64
     assert [(gap.start, gap.end, gap.missing) for gap in row.gaps] == [(0.5 - 1 / 64, 0.75, 16)]
 
