@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from valve_drake.messages import Health, Mode, ModeState, Status, StereoPosition
-from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs, lock, profile
+from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs, lock
 
 
 class CounterInputs(Inputs):
@@ -259,17 +259,6 @@ def test_a_source_block_says_its_value_of_the_time_in_slot_0():
     rig.run(0.25 + SLOT / 2)
     assert (rig.read("value").time, rig.read("value").value) == (0.25, 2.5)
     assert_holds_between_updates(rig, "value", slot=0)
-
-
-def test_profile_counts_every_second_once():
-    before = dict(profile.seconds)
-    with profile("outer of the test"):
-        with profile("inner of the test"):
-            sum(range(200_000))
-        inner = profile.seconds["inner of the test"]
-    outer = profile.seconds["outer of the test"]
-    assert inner > 0 and 0 <= outer < inner
-    assert before.get("stages", 0) == profile.seconds.get("stages", 0)
 
 
 def test_an_error_of_who_is_read_is_not_taken_for_a_port_without_a_value():

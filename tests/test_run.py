@@ -311,6 +311,12 @@ def test_run_json_prints_one_object(tmp_path, capsys, monkeypatch):
     for key in ("sim_time_s", "wall_time_s", "real_time_factor", "peak_hand_force_N", "log"):
         assert key in result
     assert (tmp_path / "a.json").is_file()
+    spent = result["processor_s"]
+    assert {"robot_state", "supervisor", "odometry"} <= spent["stages"].keys()
+    parts = [seconds for kind, seconds in spent.items() if kind not in ("stages", "plant", "waited", "total")]
+    assert min(parts) >= 0 and spent["total"] == pytest.approx(sum(parts) + sum(spent["stages"].values()), abs=2e-3)
+    for kind in ("start_up", "renderers_start_up", "framework", "logging", "rendering", "end"):
+        assert spent[kind] > 0
 
 
 @pytest.mark.slow

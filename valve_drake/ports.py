@@ -31,7 +31,6 @@ Every block uses UNRESTRICTED updates: a discrete update would see the plant alr
 
 import dataclasses as dc
 import functools
-import time as _time
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -41,6 +40,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, InputPort, LeafSystem, State
 
+from valve_drake import profiling
 from valve_drake.messages import Message
 
 TICK = 1 / 128  # control period [s]
@@ -50,37 +50,6 @@ SLOT = 1 / 512  # the slots of a tick [s]
 Kind: TypeAlias = type | int | AbstractValue
 Outputs = dict[str, Any]  # port name -> what it holds from now on; ports left out keep their value
 
-
-class Profile:
-    """Wall time by kind of work, each second counted once (inner work is taken off the outer's)."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.render_worker_seconds = 0.0  # processor time of the processes that render images
-        self._stack: list[tuple[str, float]] = []  # kind, start
-        self._inner: list[float] = []  # seconds of the work inside each
-
-    def clear(self) -> None:
-        self.seconds.clear()
-        self.render_worker_seconds = 0.0
-
-    def __call__(self, kind: str) -> "Profile":
-        self._stack.append((kind, _time.perf_counter()))
-        self._inner.append(0.0)
-        return self
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, *_: object) -> None:
-        kind, start = self._stack.pop()
-        spent = _time.perf_counter() - start
-        self.seconds[kind] = self.seconds.get(kind, 0.0) + spent - self._inner.pop()
-        if self._inner:
-            self._inner[-1] += spent
-
-
-profile = Profile()
 
 _REQUIRED = object()  # instead of a default: reading the port while nothing is connected is an error
 
@@ -183,6 +152,7 @@ class Block(LeafSystem, Generic[In, M]):
         """Runs every `period` seconds in slot `slot` of a tick, the first time `delay` seconds after 0."""
         super().__init__()
         self.set_name(name)
+        self._name = name
         self.input_ports: dict[str, tuple[InputPort, Kind]] = {}
         for port, kind in {**self._inputs.PORTS, **self.INPUTS}.items():
             if isinstance(kind, int):
@@ -237,7 +207,7 @@ class Block(LeafSystem, Generic[In, M]):
                 activation = mode.activation
                 if context.get_abstract_state(int(self._memory)).get_value().asleep == activation:
                     return
-        with profile("stages"):
+        with profiling.work(profiling.STAGE, self._name):
             memory, outputs = work(context.get_time(), inputs, self.memory(context))
         abstract = state.get_mutable_abstract_state()
         abstract.get_mutable_value(int(self._memory)).set_value(_Held(memory, activation))

@@ -22,7 +22,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
-from valve_drake import config, outputs, resources, yaml_file
+from valve_drake import config, outputs, profiling, resources, yaml_file
 from valve_drake.analysis.comparison import Comparison
 from valve_drake.analysis.metrics import Summary, summarize
 from valve_drake.behaviors.taught import load_taught
@@ -32,7 +32,7 @@ from valve_drake.config import key_names
 from valve_drake.diagram import System, command, make_diagram
 from valve_drake.messages import Mode, ModeState, OperatorCommand, Verdict
 from valve_drake.pace import PACE, Pace, Pacer
-from valve_drake.ports import SLOT, TICK, profile
+from valve_drake.ports import SLOT, TICK
 from valve_drake.recording import layout
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recorder_system import RecorderSystem, Sink, Tee
@@ -85,8 +85,7 @@ class Result:
     html: Path | None
     log_error: str  # why logging stopped; `say` was told
     troubles: tuple[str, ...]  # what else went wrong, in lines for the user
-    shares: dict[str, float]  # of the wall time, by kind of work; of rendering, what the run waited for
-    render_worker_seconds: float  # processor time of the rendering processes [s]
+    spent: profiling.Spent  # processor time, by kind of work
     pace: Pace | None  # how real time was kept, where it was
 
     def as_json(self) -> dict[str, Any]:
@@ -109,8 +108,7 @@ class Result:
             "turn_mean_hand_force_N": s.turn_mean_hand_force_N,
             "turn_mean_stem_force_N": s.turn_mean_stem_force_N,
             "turn_share_left": s.turn_share_left,
-            "shares": {kind: round(share, 4) for kind, share in self.shares.items()},
-            "rendering_beside_s": self.render_worker_seconds,
+            "processor_s": self.spent.as_json(),
             "pace": self.pace and self.pace.as_json(),
             "log": str(self.log) if self.log else None,
             "log_error": self.log_error,
@@ -176,9 +174,9 @@ def run(
     cv2.setNumThreads(1)  # the same bits on any machine, and the renderer wants the cores
     if scenario.station == "hardware":
         recording = meshcat = False  # 3D views exist in simulation only
-    profile.clear()
     troubles = []
     with contextlib.ExitStack() as stack:
+        profile = stack.enter_context(profiling.measure())
         workers = None
         if scenario.station == "hardware":
             link = link or RobotLink(Bus(scenario.hardware), stop=stop)
@@ -196,10 +194,16 @@ def run(
         simulator = Simulator(system.diagram)
         if recording and view is not None:
             view.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat)
+        profile.ends(profiling.START_UP)
         begin = time.perf_counter()
         paced = scenario.station == "hardware" and not scenario.hardware.lockstep
         pacer = Pacer(idle=link.pass_time) if paced and link is not None else None
-        go = simulator.AdvanceTo if pacer is None else _in_real_time(simulator, pacer, sink)
+
+        def advance(until: float) -> None:
+            with profiling.advance():
+                simulator.AdvanceTo(until)
+
+        go = advance if pacer is None else _in_real_time(simulator, advance, pacer, sink)
         last, told = Progress(ModeState(), 0.0, 0.0), False
 
         def watch(progress: Progress) -> None:
@@ -218,14 +222,17 @@ def run(
             mode = dc.replace(last.mode, mode=Mode.FAILED, verdict=Verdict.FAULT, reason=str(error))
             troubles.append(str(error))
         wall, end = time.perf_counter() - begin, simulator.get_context().get_time()
+        profile.writing = writer.spent
+        profile.ends(profiling.ADVANCES)
+        if workers is not None:
+            profile.renderers_start_up, profile.rendering = workers.spent
         writer.write_metadata("result", _result_metadata(mode, end))
     if writer.error and not told:
         say(writer.error)
     html = _write_recording(view, writer, troubles) if recording else None
-    shares = {kind: seconds / wall for kind, seconds in profile.seconds.items()}
-    shares["physics"] = 1.0 - sum(shares.values())
     pace = pacer.report(mode.time) if pacer else None
     summary = _summary(writer, mode, end)
+    profile.ends(profiling.END)
     return Result(
         summary,
         wall,
@@ -234,8 +241,7 @@ def run(
         html,
         writer.error,
         tuple(troubles),
-        shares,
-        profile.render_worker_seconds,
+        profile.spent(),
         pace,
     )
 
@@ -324,7 +330,8 @@ def _advance(
     """go: advances the simulator to a time."""
     context = simulator.get_mutable_context()
     command(system, context, OperatorCommand(sequence=0, command=scenario.command, angle=scenario.angle))
-    simulator.Initialize()
+    with profiling.advance():
+        simulator.Initialize()
     port = system.supervisor.GetOutputPort("mode")
     inner = system.supervisor.GetMyContextFromRoot(context)
     end = scenario.time_limit if duration is None else min(duration, scenario.time_limit)
@@ -347,7 +354,9 @@ def _advance(
         go(min(now + STEP, end))
 
 
-def _in_real_time(simulator: Simulator, pacer: Pacer, sink: Sink) -> Callable[[float], None]:
+def _in_real_time(
+    simulator: Simulator, advance: Callable[[float], None], pacer: Pacer, sink: Sink
+) -> Callable[[float], None]:
     """AdvanceTo, paced by the wall clock, in two parts a tick: the first ends when the commands are sent, at the start
     of slot 3; the second is slot 3, whose slow work delays no command."""
     gc.collect()
@@ -357,7 +366,7 @@ def _in_real_time(simulator: Simulator, pacer: Pacer, sink: Sink) -> Callable[[f
     def go(until: float) -> None:
         while True:
             tick = int(context.get_time() / TICK + 1 / 4) * TICK
-            commands, rest = (functools.partial(simulator.AdvanceTo, tick + end) for end in (3 * SLOT, TICK - AHEAD))
+            commands, rest = (functools.partial(advance, tick + end) for end in (3 * SLOT, TICK - AHEAD))
             pacer.tick(commands, rest)
             now = context.get_time()
             if int(tick) != int(tick + TICK):

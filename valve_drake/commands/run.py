@@ -2,8 +2,10 @@
 
 import argparse
 import contextlib
+import dataclasses as dc
 import json
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +27,7 @@ from valve_drake.console import complain, console, say
 
 if TYPE_CHECKING:
     from valve_drake import runner
+    from valve_drake.profiling import Spent
     from valve_drake.recording.recorder_system import Sink
 
 
@@ -45,7 +48,7 @@ def add(commands: Subcommands) -> None:
     p.add_argument("--no-html", action="store_true", help="no 3D recording beside the log")
     p.add_argument("--no-truth", action="store_true", help="leave the simulation's truth out of the log")
     p.add_argument("--duration", type=float, metavar="SECONDS", help="end after this simulated time")
-    p.add_argument("--profile", action="store_true", help="print the shares of physics, rendering, stages and logging")
+    p.add_argument("--profile", action="store_true", help="print where the processor time went")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(command=command)
 
@@ -67,6 +70,7 @@ def command(options: argparse.Namespace) -> int:
         inputs = [Path(name) for name in (options.scenario, scenario.head_calibration, scenario.taught) if name]
         companions = (".json", ".html") if recording else (".json",)
         log = check_log(options.log, "--log", options.overwrite, inputs, companions)
+    imports = time.process_time()
     with stopper() as stop, _live(options) as live, display(not options.json) as show:
         result = run(
             scenario,
@@ -81,6 +85,7 @@ def command(options: argparse.Namespace) -> int:
             say=complain,
             stop=stop,
         )
+    result = dc.replace(result, spent=dc.replace(result.spent, imports=imports))
     numbers = result.as_json()
     troubles = [*result.troubles]
     try:
@@ -93,9 +98,7 @@ def command(options: argparse.Namespace) -> int:
     else:
         _print_result(result)
     if options.profile and not options.json:
-        for kind, share in sorted(result.shares.items(), key=lambda item: -item[1]):
-            print(f"{kind:>10}  {100 * share:5.1f} %  {share * result.wall_time:6.2f} s")
-        print(f"{result.render_worker_seconds:.2f} s of rendering on other processors; above, what the run waited for")
+        _print_spent(result.spent)
     for line in troubles:
         complain(line)
     cut_short = options.duration is not None and not result.summary.outcome
@@ -125,3 +128,12 @@ def _print_result(result: "runner.Result") -> None:
         say("these numbers are of what was logged; the verdict is the run's")
     if result.log is not None:
         say(f"log {result.log}" + (f"  3D recording {result.html}" if result.html else ""))
+
+
+def _print_spent(spent: "Spent") -> None:
+    """Processor seconds, the dearest first; below, those of the stages block by block."""
+    for name, seconds in sorted(spent.parts().items(), key=lambda item: -item[1]):
+        print(f"{seconds:9.3f} s  {100 * seconds / spent.total:5.1f} %  {name}")
+    print(f"{spent.total:9.3f} s of processor time; besides, {spent.waited:.2f} s of waiting for images")
+    for block, seconds in sorted(spent.stages.items(), key=lambda item: -item[1]):
+        print(f"{seconds:9.3f} s  {100 * seconds / spent.total:5.1f} %  stage {block}")

@@ -11,7 +11,8 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, InputPort, LeafSystem
 
-from valve_drake.ports import TICK, Kind, profile
+from valve_drake import profiling
+from valve_drake.ports import TICK, Kind
 from valve_drake.recording.schemas import Loggable, serialized
 
 ONCE = math.inf  # a period: at the start only
@@ -92,7 +93,7 @@ class RecorderSystem(LeafSystem):
         return self._ports[name]
 
     def _publish(self, context: Context) -> None:
-        with profile("logging"):
+        with profiling.work(profiling.LOGGING):
             if not self._begun:
                 self._begun = True
                 self._rows = [row for row in self._rows if all(port.connected(context) for port in row.ports)]

@@ -17,6 +17,7 @@ import logging
 import os
 import queue
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -56,6 +57,7 @@ class LogWriter:
         self._interval = 0  # of FLUSH_PERIOD, that the last message belongs to
         self._handed, self._written = 0, 0  # bytes, to the thread and by it
         self._error = ""
+        self.spent = 0.0  # processor time of the thread [s]
         self._told = self._closed = False
         self._jobs: queue.SimpleQueue[tuple[int, Callable[..., object], tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="log writer", daemon=True)
@@ -189,6 +191,7 @@ class LogWriter:
                 except Exception as error:  # whatever it is, it must not end the run
                     self._stop(_words(error))
             self._written += size
+            self.spent = time.thread_time()
         if self._error:
             self._file.close()
 

@@ -32,10 +32,10 @@ from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo
 
+from valve_drake import profiling
 from valve_drake.camera.lens import Lens, distortion_maps
 from valve_drake.frames import compose, make, rot_z
 from valve_drake.messages import CameraFrame
-from valve_drake.ports import profile
 from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.simulation_config import CameraConfig, LightConfig, ValveConfig
@@ -298,5 +298,5 @@ class CameraSystem(LeafSystem):
         if capture.sequence < 0:
             output.set_value(CameraFrame(camera=self.get_name()))
             return
-        with profile("rendering"):
+        with profiling.work(profiling.IMAGES):
             output.set_value(self._images.frame(self.get_name(), capture))

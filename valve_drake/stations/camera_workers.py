@@ -24,9 +24,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from valve_drake import profiling
 from valve_drake.checks import OperationFailed
 from valve_drake.messages import CameraFrame
-from valve_drake.ports import profile
 from valve_drake.stations import render_egl
 from valve_drake.stations.camera_rig import CameraRig, Capture
 from valve_drake.stations.contract import CAMERAS, HEAD, MATE, WRISTS
@@ -42,6 +42,12 @@ class _Worker:
     wait: Callable[[], int]  # until it has ended -> its exit code, or minus the signal that ended it
     wire: multiprocessing.connection.Connection
 
+    @property
+    def pid(self) -> int:
+        pid = self.process.pid
+        assert pid is not None  # it was started
+        return pid
+
 
 class CameraWorkers:
     """Makes images in other processes while open; `start` says of what. Use: `with CameraWorkers() as workers:`.
@@ -55,6 +61,7 @@ class CameraWorkers:
         self._captures: dict[str, collections.deque[Any]] = {name: collections.deque(maxlen=KEPT) for name in CAMERAS}
         self._asked: dict[str, dict[int, Capture]] = {name: {} for name in CAMERAS}
         self._made: dict[tuple[str, int], CameraFrame] = {}
+        self._spent: dict[int, list[float]] = {}  # by process: until it was ready, and since [s]
         self._read: dict[str, tuple[int, int]] = {}  # sequence read last, and how many captures after the one before
 
     def __enter__(self) -> "CameraWorkers":
@@ -81,6 +88,11 @@ class CameraWorkers:
             with contextlib.suppress(OSError):  # one that has ended is named when it is asked for an image
                 _send(worker.wire, rig)
         return self
+
+    @property
+    def spent(self) -> tuple[float, float]:
+        """Processor time of the processes, until they could make images and for those that have come [s]."""
+        return sum(s[0] for s in self._spent.values()), sum(s[1] for s in self._spent.values())
 
     def captured(self, name: str, capture: Capture) -> None:
         """Begins the image if the reader's habit says that this one will be looked at."""
@@ -119,8 +131,10 @@ class CameraWorkers:
 
     def _receive(self, name: str) -> None:
         with self._wire(name) as wire:
-            frame, seconds = _recv(wire)
-        profile.render_worker_seconds += seconds
+            with profiling.work(profiling.WAITING):
+                wire.poll(None)
+            frame, *spent = _recv(wire)
+        self._spent[self._worker(name).pid] = spent
         self._made[frame.camera, frame.sequence] = frame
 
     def _receive_all(self) -> None:
@@ -212,10 +226,10 @@ def serve(fd: int) -> None:
     wire = multiprocessing.connection.Connection(fd)
     try:
         rig = CameraRig(*_recv(wire))
+        start_up = time.process_time()
         while True:
             name, capture = _recv(wire)
-            begin = time.process_time()
             frame = rig.frame(name, capture)
-            _send(wire, (frame, time.process_time() - begin))
+            _send(wire, (frame, start_up, time.process_time() - start_up))
     except (EOFError, ConnectionError):
         pass

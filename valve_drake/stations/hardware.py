@@ -30,10 +30,11 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, Diagram, LeafSystem, State
 
+from valve_drake import profiling
 from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.console import complain
 from valve_drake.messages import SIDES, CameraFrame, Health
-from valve_drake.ports import SLOT, TICK, profile
+from valve_drake.ports import SLOT, TICK
 from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rig import decode_image
 from valve_drake.stations.contract import CAMERAS, CONTRACT, HEAD, station_of
@@ -399,7 +400,7 @@ class RobotLink:
     def _decoded(self, camera: str, image: _Image) -> CameraFrame:
         """The image, or one without pixels if it cannot be decoded: then it was no news."""
         if image.frame is None:
-            with profile("images"):
+            with profiling.work(profiling.IMAGES):
                 image.frame = self._decode(camera, image)
         return image.frame
 

@@ -94,7 +94,7 @@ class LiveImages(CameraWorkers):
                 notice(f"the twin waits for its renderers: no image yet of {missing}")
         if hasattr(os, "SCHED_IDLE"):  # Linux: rather a late image than a late tick of either side
             for worker in self._workers:
-                os.sched_setscheduler(worker.process.pid, os.SCHED_IDLE, os.sched_param(0))
+                os.sched_setscheduler(worker.pid, os.SCHED_IDLE, os.sched_param(0))
 
     def captured(self, name: str, capture: Capture) -> None:
         # A camera that cannot keep up drops images; the two of a pair drop the same ones.
