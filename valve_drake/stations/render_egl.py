@@ -248,6 +248,7 @@ class _OpenGL:
         except Exception as error:
             raise RuntimeError(f"no OpenGL 3.3 by EGL: {error}") from error
         self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
+        self._pixels: dict[tuple[int, int], np.ndarray] = {}
 
     def alive(self) -> bool:
         """Whether it can be made current.
@@ -263,6 +264,12 @@ class _OpenGL:
             color, depth = self.context.renderbuffer(size, 4), self.context.depth_renderbuffer(size)
             self._targets[size] = self.context.framebuffer(color, depth)
         return self._targets[size]
+
+    def pixels(self, width: int, height: int) -> np.ndarray:
+        """Where an image of this size is read to (height, width, 4) uint8: fresh memory would cost as much again."""
+        if (width, height) not in self._pixels:
+            self._pixels[width, height] = np.zeros((height, width, 4), np.uint8)
+        return self._pixels[width, height]
 
 
 _opened: list[_OpenGL] = []  # the newest last: an engine shares it with all others
@@ -288,7 +295,10 @@ class _Stage:
         kind = np.dtype([("position", "3f4"), ("normal", "3f4"), ("color", "3f4"), ("geometry", "i4")])
         corners = np.zeros(sum(len(s.points) for s in surfaces), kind)
         start = 0
-        for k, s in enumerate(surfaces):
+        # Large surfaces last: most of what lies behind the others is then rejected by depth, before it is shaded.
+        order = sorted(range(len(surfaces)), key=lambda k: float(np.ptp(surfaces[k].points, axis=0).max(initial=0.0)))
+        for k in order:
+            s = surfaces[k]
             part = corners[start : start + len(s.points)]
             part["position"], part["normal"], part["color"], part["geometry"] = s.points, s.normals, s.colors, k
             start += len(part)
@@ -327,8 +337,8 @@ class _Stage:
                     else:
                         program[name].value = value
                 self._vertices.render(moderngl.TRIANGLES)
-            data = target.read(components=4)
-        return np.frombuffer(data, np.uint8).reshape(height, width, 4)
+            target.read_into(self.gl.pixels(width, height), components=4)
+        return self.gl.pixels(width, height)
 
 
 # ---------------------------------------------------------------- surfaces
