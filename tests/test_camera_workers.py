@@ -32,8 +32,8 @@ def rig(rig_arguments):
 
 @pytest.fixture
 def workers(rig_arguments):
-    with CameraWorkers() as workers:
-        yield workers.start(*rig_arguments)
+    with CameraWorkers(*rig_arguments) as workers:
+        yield workers
 
 
 def captures(rig, count, offset=0.0):
@@ -80,8 +80,7 @@ def test_a_simulation_begun_anew_gets_its_own_images(rig, workers):
 
 @pytest.mark.parametrize("gone", [True, False])
 def test_the_processes_end_with_the_block_and_a_lost_one_is_named(rig, rig_arguments, gone):
-    with CameraWorkers() as workers:
-        workers.start(*rig_arguments)
+    with CameraWorkers(*rig_arguments) as workers:
         processes = [worker.process for worker in workers._workers]
         processes[0].kill()
         if gone:  # before it is asked, else while it is
@@ -100,8 +99,7 @@ rig, capture, beside = pickle.load(sys.stdin.buffer)
 threads = [threading.Thread(target=threading.Event().wait, daemon=True) for _ in range(beside)]
 for thread in threads:
     thread.start()
-with CameraWorkers() as workers:
-    workers.start(*rig)
+with CameraWorkers(*rig) as workers:
     data = workers.frame("head_right", capture).data
     kinds = [type(worker.process).__name__ for worker in workers._workers]
 sys.stdout.buffer.write(pickle.dumps((kinds, data)))

@@ -206,13 +206,26 @@ def test_a_mesh_without_materials_takes_the_property_and_one_with_them_its_own(t
     (tmp_path / "two.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl other\nKa 1 1 1\n")
     square = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nv 3 -1 0\nv 3 1 0\n"
     (tmp_path / "two.obj").write_text(f"mtllib two.mtl\n{square}usemtl red\nf 1 4 3 2\nusemtl other\nf 2 -4 -1 -2\n")
-    points, normals, colors = read_obj(str(tmp_path / "two.obj"), 0.0)
+    *surface, corners = read_obj(str(tmp_path / "two.obj"), 0.0)
+    points, normals, colors = (part[corners] for part in surface)
     assert points.shape == normals.shape == colors.shape == (12, 3)
     assert (normals[:, 2] < 0).all()  # flat ones, by the order of the corners
     assert (colors[:6] == [1, 0, 0]).all() and np.isnan(colors[6:]).all()
     image = draw([(Mesh(str(tmp_path / "two.obj"), 0.2), at(0, 0, 1), (0.0, 0.0, 1.0, 1.0))])
     assert image[118, 130, 0] > 100 and image[118, 130, 2] == 0
     assert image[118, 260, 2] > 100 and image[118, 260, 0] == 0
+
+
+def test_corners_that_triangles_share_are_held_once_and_a_mirrored_mesh_is_seen_from_outside(tmp_path):
+    path = tmp_path / "square.obj"
+    path.write_text("v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvn 0 0 -1\nf 1//1 4//1 3//1 2//1\n")
+    points, normals, _, corners = read_obj(str(path), 0.0)
+    assert points.shape == normals.shape == (4, 3) and (normals == [0, 0, -1]).all()
+    assert points[corners].tolist() == [[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [-1, -1, 0], [1, 1, 0], [1, -1, 0]]
+    white = (1.0, 1.0, 1.0, 1.0)
+    plain = draw([(Mesh(str(path), 0.2), at(0, 0, 1), white)])
+    mirrored = draw([(Mesh(str(path), np.array([-0.2, 0.2, 0.2])), at(0, 0, 1), white)])
+    assert plain[120, 160, 0] > 100 and (mirrored == plain).all()
 
 
 def test_what_is_invisible_or_removed_is_not_drawn():

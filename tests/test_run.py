@@ -150,14 +150,14 @@ def test_a_log_folder_that_is_moved_in_mid_run_keeps_the_log_and_the_verdict(tmp
 
 
 def test_a_rendering_process_that_is_killed_ends_the_run_with_a_verdict_and_a_whole_log(here, capsys, monkeypatch):
-    start = runner.CameraWorkers.start
+    enter = runner.CameraWorkers.__enter__
 
-    def kill_one(self, *rig):
-        start(self, *rig)
+    def kill_one(self):
+        enter(self)
         self._workers[0].process.kill()
         return self
 
-    monkeypatch.setattr(runner.CameraWorkers, "start", kill_one)
+    monkeypatch.setattr(runner.CameraWorkers, "__enter__", kill_one)
     code, out, err = command(capsys, "--duration", "2", "--log", "a.mcap", "--json")
     result = json.loads(out)
     assert code == 1 and (result["outcome"], result["verdict"]) == ("failed", "fault")

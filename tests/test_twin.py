@@ -338,7 +338,7 @@ def test_a_twin_that_lives_by_the_clock_sends_the_images_that_are_asked_for_and_
     lcm, seen = DrakeLcm("memq://"), []
     bus = Bus(scenario.hardware, lcm)
     bus.listen(ROBOT, lambda key, message: seen.append(message.images[0].header) if key.endswith(".image") else None)
-    with rehearsal.LiveImages() as images:
+    with rehearsal.LiveImages(*rehearsal.rig_of(scenario)) as images:
         twin = rehearsal.make_twin(scenario, workers=images, lcm=lcm)
         begin = wall.monotonic()
         while len(seen) < 2:

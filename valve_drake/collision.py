@@ -3,13 +3,11 @@
 import numpy as np
 from pydrake.geometry import QueryObject
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-from pydrake.systems.framework import DiagramBuilder
 
 from valve_drake.frames import compose, make
 from valve_drake.messages import SIDES
 from valve_drake.perception.marker import Marker
-from valve_drake.stations.scene import parse
+from valve_drake.stations.scene import model
 
 FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the valve's pose while none is known
 
@@ -22,19 +20,15 @@ class CollisionModel:
     """
 
     def __init__(self, marker: Marker, clearance: float = 0.015, opening: float = 0.085):
-        builder = DiagramBuilder()
-        self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-        robot = parse(self._plant, "robot")
-        self._valve = parse(self._plant, "valve")
-        self._plant.Finalize()
-        self._diagram = builder.Build()
-        self._root = self._diagram.CreateDefaultContext()
+        self._model = shared = model()
+        self._plant, self._scene_graph, self._valve = shared.plant, shared.scene_graph, shared.valve
+        self._root = shared.diagram.CreateDefaultContext()
         self._context = self._plant.GetMyMutableContextFromRoot(self._root)
         self._clearance = clearance
         self._panel_depth = marker.panel_depth
         joint = self._plant.GetJointByName
-        self._arm = [joint(f"{side}_arm_{k}", robot).position_start() for side in SIDES for k in range(1, 7)]
-        self._fingers = [joint(f"{side}_finger_{k}", robot).position_start() for side in SIDES for k in (1, 2)]
+        self._arm = [joint(f"{side}_arm_{k}", shared.robot).position_start() for side in SIDES for k in range(1, 7)]
+        self._fingers = [joint(f"{side}_finger_{k}", shared.robot).position_start() for side in SIDES for k in (1, 2)]
         self._opening = opening
 
     def _pose(self, X_BV: np.ndarray | None, q: np.ndarray) -> QueryObject:

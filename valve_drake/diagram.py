@@ -23,7 +23,7 @@ from valve_drake.behaviors.kinematic_approach import KinematicApproach
 from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
-from valve_drake.camera.lens import load_head
+from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, make
@@ -44,7 +44,7 @@ from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CONTRACT
 from valve_drake.stations.hardware import RobotLink, make_hardware_station
 from valve_drake.stations.replay import Recording, make_replay_station
-from valve_drake.stations.simulated import make_simulated_station
+from valve_drake.stations.simulated import make_simulated_station, rig_arguments
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
 from valve_drake.supervisor.supervisor import BEHAVIORS
 from valve_drake.supervisor.supervisor_system import SupervisorSystem
@@ -136,7 +136,7 @@ def make_station(
     return make_simulated_station(
         scenario.simulation,
         (scenario.marker.size[0], scenario.marker.size[1]),
-        load_head(resources.find(scenario.head_calibration, resources.models())),
+        _head(scenario),
         home(scenario),
         scenario.kinematic_approach.opening,
         scenario.seed,
@@ -145,9 +145,19 @@ def make_station(
     )
 
 
+def rig_of(scenario: Scenario) -> tuple[Any, ...]:
+    """The simulated cameras of a resolved scenario, as the arguments of CameraRig or CameraWorkers."""
+    size = (scenario.marker.size[0], scenario.marker.size[1])
+    return rig_arguments(scenario.simulation, size, _head(scenario), scenario.seed)
+
+
+def _head(scenario: Scenario) -> StereoHead:
+    return load_head(resources.find(scenario.head_calibration, resources.models()))
+
+
 def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     """All blocks between the station's outputs and its inputs: the same objects for every station."""
-    head = load_head(resources.find(scenario.head_calibration, resources.models()))
+    head = _head(scenario)
     taught = load_taught(resources.find(scenario.taught, resources.models()))
     marker = scenario.marker
     view = {side: taught[side].view for side in SIDES}
@@ -187,7 +197,8 @@ def make_diagram(
 ) -> System:
     """The whole system for a resolved scenario; `recording` is what station `replay` shows, `link` leads to a robot.
 
-    workers: render the simulated cameras' images in other processes. truth=False: the recorder gets no `truth.*` ports.
+    workers: of `rig_of`, render the simulated cameras' images in other processes. truth=False: the recorder gets no
+    `truth.*` ports.
     """
     builder = DiagramBuilder()
     station = builder.AddSystem(make_station(scenario, meshcat, recording, workers, link))

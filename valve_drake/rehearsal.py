@@ -10,7 +10,7 @@ import cv2
 from pydrake.lcm import DrakeLcm
 
 from valve_drake.console import complain
-from valve_drake.diagram import initial_commands, make_station
+from valve_drake.diagram import initial_commands, make_station, rig_of
 from valve_drake.pace import Pace, Pacer
 from valve_drake.ports import SLOT
 from valve_drake.scenario import Scenario, resolve
@@ -65,7 +65,7 @@ def beside(scenario: Scenario) -> Iterator[tuple[RobotLink, Twin]]:
     scenario = resolve(scenario)
     lcm = DrakeLcm("memq://")
     hardware = dc.replace(scenario.hardware, lockstep=True)
-    with CameraWorkers() as workers:
+    with CameraWorkers(*rig_of(scenario)) as workers:
         twin = make_twin(dc.replace(scenario, hardware=hardware), workers=workers, lcm=lcm)
         yield RobotLink(Bus(hardware, lcm), idle=twin.poll), twin
 
@@ -87,7 +87,7 @@ def run_twin(
     scenario.check()
     cv2.setNumThreads(1)
     lockstep = scenario.hardware.lockstep
-    with CameraWorkers() if lockstep else LiveImages() as workers:
+    with (CameraWorkers if lockstep else LiveImages)(*rig_of(scenario)) as workers:
         twin = make_twin(scenario, workers=workers)
         begin = float(twin.read("truth.valve_angle")[0])
         if isinstance(workers, LiveImages):

@@ -29,7 +29,7 @@ from valve_drake.behaviors.taught import load_taught
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError, OperationFailed, require
 from valve_drake.config import key_names
-from valve_drake.diagram import System, command, make_diagram
+from valve_drake.diagram import System, command, make_diagram, rig_of
 from valve_drake.messages import Mode, ModeState, OperatorCommand, Verdict
 from valve_drake.pace import PACE, Pace, Pacer
 from valve_drake.ports import SLOT, TICK
@@ -181,7 +181,9 @@ def run(
         if scenario.station == "hardware":
             link = link or RobotLink(Bus(scenario.hardware), stop=stop)
         else:
-            workers = stack.enter_context(CameraWorkers())  # before view and writer, which start threads
+            workers = stack.enter_context(
+                CameraWorkers(*rig_of(scenario))
+            )  # before view and writer, which start threads
         view = _make_view(say if meshcat else None) if recording or meshcat else None
         writer = LogWriter(log, companions=(".json", ".html") if recording else (".json",), overwrite=overwrite)
         stack.enter_context(_log_kept(writer))

@@ -1,8 +1,6 @@
 """Poses of all bodies of robot and valve, computed from measurements and estimates, for the log's 3D view."""
 
 import numpy as np
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-from pydrake.systems.framework import DiagramBuilder
 
 from valve_drake.behaviors.grasp_geometry import turned
 from valve_drake.camera.lens import StereoHead
@@ -10,7 +8,7 @@ from valve_drake.frames import compose, make, planar
 from valve_drake.messages import SIDES, GraspPlan, RectangleEstimate, RobotState, TurnState
 from valve_drake.perception.marker import Marker
 from valve_drake.recording.scene import parts_of, scene
-from valve_drake.stations.scene import parse
+from valve_drake.stations.scene import model
 
 Transforms = list[tuple[str, str, np.ndarray]]
 ODOMETRY = "odometry"
@@ -20,12 +18,8 @@ class RobotFrames:
     """The controllers' model of the robot in its measured pose. Frames are named as in SceneGraph ("robot::chest")."""
 
     def __init__(self, head: StereoHead, marker: Marker):
-        builder = DiagramBuilder()
-        self._plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-        robot = parse(self._plant, "robot")
-        parse(self._plant, "valve")
-        self._plant.Finalize()
-        self._diagram = builder.Build()
+        self._model = shared = model()
+        self._plant, robot = shared.plant, shared.robot
         self._context = self._plant.CreateDefaultContext()
         self._poses = self._plant.get_body_poses_output_port()
         self._bodies = {int(i): f"robot::{self._plant.get_body(i).name()}" for i in self._plant.GetBodyIndices(robot)}
@@ -35,7 +29,7 @@ class RobotFrames:
             ("head_left", "head_right", head.X_LR),
         ]
         self._X_VWheel = make(np.eye(3), np.array([0.0, 0.0, marker.panel_depth]))
-        self.scene = scene(parts_of(scene_graph.model_inspector()))
+        self.scene = scene(parts_of(shared.scene_graph.model_inspector()))
         self._slots = {
             "base": [self._slot(n) for n in ("base_x", "base_y", "base_yaw")],
             "torso": [self._slot(n) for n in ("waist", "neck_pitch", "neck_yaw")],

@@ -1,6 +1,7 @@
 """The visual shapes of robot, valve and room as foxglove.SceneUpdate, for the viewers' 3D panels."""
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -37,15 +38,16 @@ def scene(parts: Iterable[Part], time: float = 0.0) -> SceneUpdate:
     Boxes, spheres, cylinders and .obj meshes; other shapes have no counterpart and are left out.
     """
     update, entities = SceneUpdate(), {}
+    read = functools.cache(_read)  # several parts have the same mesh
     for frame, shape, X, rgba in parts:
         if frame not in entities:
             entities[frame] = update.entities.add(timestamp=stamp(time), frame_id=frame, id=frame, frame_locked=True)
         r, g, b, a = rgba
-        _draw(entities[frame], shape, np.asarray(X), Color(r=r, g=g, b=b, a=a))
+        _draw(entities[frame], shape, np.asarray(X), Color(r=r, g=g, b=b, a=a), read)
     return update
 
 
-def _draw(entity: SceneEntity, shape: Shape, X: np.ndarray, color: Color) -> None:
+def _draw(entity: SceneEntity, shape: Shape, X: np.ndarray, color: Color, read: "ReadMesh") -> None:
     look = {"pose": pose(X), "color": color}
     match shape:
         case Box():
@@ -56,10 +58,18 @@ def _draw(entity: SceneEntity, shape: Shape, X: np.ndarray, color: Color) -> Non
             diameter = 2 * shape.radius()
             entity.cylinders.add(size=_size([diameter, diameter, shape.length()]), bottom_scale=1, top_scale=1, **look)
         case Mesh() if shape.extension() == ".obj":
-            mesh = ReadObjToTriangleSurfaceMesh(shape.source().path(), shape.scale3())
-            points = [Point3(x=x, y=y, z=z) for x, y, z in np.array(mesh.vertices()).tolist()]
-            indices = [triangle.vertex(k) for triangle in mesh.triangles() for k in range(3)]
+            points, indices = read(str(shape.source().path()), tuple(shape.scale3()))
             entity.triangles.add(points=points, indices=indices, **look)
+
+
+ReadMesh = Callable[[str, tuple[float, ...]], tuple[list[Point3], list[int]]]
+
+
+def _read(path: str, scale: tuple[float, ...]) -> tuple[list[Point3], list[int]]:
+    """Vertices of an OBJ's triangles, and three indices a triangle."""
+    mesh = ReadObjToTriangleSurfaceMesh(path, np.array(scale))
+    points = [Point3(x=x, y=y, z=z) for x, y, z in np.array(mesh.vertices()).tolist()]
+    return points, [triangle.vertex(k) for triangle in mesh.triangles() for k in range(3)]
 
 
 def _size(lengths: Iterable[float]) -> Vector3:

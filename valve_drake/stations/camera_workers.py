@@ -50,13 +50,14 @@ class _Worker:
 
 
 class CameraWorkers:
-    """Makes images in other processes while open; `start` says of what. Use: `with CameraWorkers() as workers:`.
+    """Makes images in other processes while open. Use: `with CameraWorkers(*rig) as workers:`; rig: of CameraRig.
 
-    A process with one thread is forked, which spares each worker the imports; one with more cannot be forked safely,
-    and starts new ones. So it is cheapest to enter before anything that keeps a thread.
+    A process with one thread is forked, which spares the workers the imports and each a rig of its own; one with more
+    cannot be forked safely, and starts new ones. So it is cheapest to enter before anything that keeps a thread.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *rig: Any) -> None:
+        self._rig = rig
         self._workers: list[_Worker] = []
         self._captures: dict[str, collections.deque[Any]] = {name: collections.deque(maxlen=KEPT) for name in CAMERAS}
         self._asked: dict[str, dict[int, Capture]] = {name: {} for name in CAMERAS}
@@ -65,13 +66,17 @@ class CameraWorkers:
         self._read: dict[str, tuple[int, int]] = {}  # sequence read last, and how many captures after the one before
 
     def __enter__(self) -> "CameraWorkers":
-        start = _fork if _can_fork() else _spawn
+        rig = CameraRig(*self._rig) if _can_fork() else None
         for _ in range(WORKERS):
             here, there = socket.socketpair()
             wire = multiprocessing.connection.Connection(here.detach())
             with there:
-                mine = [*(worker.wire for worker in self._workers), wire]
-                self._workers.append(_Worker(*start(there.fileno(), mine), wire))
+                if rig is not None:
+                    mine = [*(worker.wire for worker in self._workers), wire]
+                    self._workers.append(_Worker(*_fork(rig, there.fileno(), mine), wire))
+                else:
+                    self._workers.append(_Worker(*_spawn(there.fileno()), wire))
+                    _send(wire, self._rig)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -81,13 +86,6 @@ class CameraWorkers:
         for worker in self._workers:
             worker.wait()
         self._workers = []
-
-    def start(self, *rig: object) -> "CameraWorkers":
-        """Tells the processes what to make images of. rig: the arguments of CameraRig."""
-        for worker in self._workers:
-            with contextlib.suppress(OSError):  # one that has ended is named when it is asked for an image
-                _send(worker.wire, rig)
-        return self
 
     @property
     def spent(self) -> tuple[float, float]:
@@ -177,10 +175,10 @@ def _can_fork() -> bool:
 
 
 def _fork(
-    fd: int, mine: Sequence[multiprocessing.connection.Connection]
+    rig: CameraRig, fd: int, mine: Sequence[multiprocessing.connection.Connection]
 ) -> tuple[multiprocessing.context.ForkProcess, Callable[[], int]]:
     """A copy of this process serves `fd`; mine: wires of this process, that the copy must not keep open."""
-    process = multiprocessing.context.ForkProcess(target=_serve_copy, args=(fd, mine), daemon=True)
+    process = multiprocessing.context.ForkProcess(target=_serve_copy, args=(rig, fd, mine), daemon=True)
     old = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until the copy has put away the program's answers
     try:
         process.start()
@@ -194,7 +192,7 @@ def _fork(
     return process, wait
 
 
-def _serve_copy(fd: int, mine: Sequence[multiprocessing.connection.Connection]) -> None:
+def _serve_copy(rig: CameraRig, fd: int, mine: Sequence[multiprocessing.connection.Connection]) -> None:
     for number in SIGNALS:
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
@@ -202,12 +200,10 @@ def _serve_copy(fd: int, mine: Sequence[multiprocessing.connection.Connection]) 
         wire.close()
     os.setsid()
     gc.freeze()  # what was copied stays shared
-    serve(fd)
+    serve(fd, rig)
 
 
-def _spawn(
-    fd: int, mine: Sequence[multiprocessing.connection.Connection]
-) -> tuple[subprocess.Popen[bytes], Callable[[], int]]:
+def _spawn(fd: int) -> tuple[subprocess.Popen[bytes], Callable[[], int]]:
     """A new process serves `fd`."""
     code = f"from valve_drake.stations.camera_workers import serve; serve({fd})"
     process = subprocess.Popen(
@@ -218,14 +214,16 @@ def _spawn(
     return process, process.wait
 
 
-def serve(fd: int) -> None:
-    """The other process: builds the rig, makes what it is asked for, ends when nobody is left to ask."""
+def serve(fd: int, rig: CameraRig | None = None) -> None:
+    """The other process: makes what it is asked for with a rig that it has or is told of, ends when nobody is left to
+    ask."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides when it ends
     os.nice(5)  # the run goes first where processors are few
     cv2.setNumThreads(1)
     wire = multiprocessing.connection.Connection(fd)
     try:
-        rig = CameraRig(*_recv(wire))
+        if rig is None:
+            rig = CameraRig(*_recv(wire))
         start_up = time.process_time()
         while True:
             name, capture = _recv(wire)

@@ -83,14 +83,16 @@ void main() { pixel = vec4(shade, 1.0); }
 
 @dc.dataclass(frozen=True)
 class Triangles:
-    """A surface in its geometry's frame, three rows a triangle, counterclockwise seen from outside.
+    """A surface in its geometry's frame.
 
-    points, normals, colors: (3n, 3), float32.
+    points, normals, colors: (m, 3), float32, of corners that triangles may share. corners: (3n,), three rows of them a
+    triangle, counterclockwise seen from outside.
     """
 
     points: np.ndarray
     normals: np.ndarray
     colors: np.ndarray
+    corners: np.ndarray
 
 
 class RenderEngineEgl(RenderEngine):
@@ -293,22 +295,19 @@ class _Stage:
     def __init__(self, gl: _OpenGL, surfaces: Sequence[Triangles]):
         self.gl = gl
         kind = np.dtype([("position", "3f4"), ("normal", "3f4"), ("color", "3f4"), ("geometry", "i4")])
-        corners = np.zeros(sum(len(s.points) for s in surfaces), kind)
-        start = 0
-        # Large surfaces last: most of what lies behind the others is then rejected by depth, before it is shaded.
-        order = sorted(range(len(surfaces)), key=lambda k: float(np.ptp(surfaces[k].points, axis=0).max(initial=0.0)))
-        for k in order:
-            s = surfaces[k]
-            part = corners[start : start + len(s.points)]
+        starts = np.cumsum([0, *(len(s.points) for s in surfaces)])
+        vertices = np.zeros(starts[-1], kind)
+        for k, s in enumerate(surfaces):
+            part = vertices[starts[k] : starts[k + 1]]
             part["position"], part["normal"], part["color"], part["geometry"] = s.points, s.normals, s.colors, k
-            start += len(part)
-        # Corners that several triangles share are shaded once.
-        shared, order = np.unique(corners.view([("bytes", f"V{kind.itemsize}")]), return_inverse=True)
+        # Large surfaces last: most of what lies behind the others is then rejected by depth, before it is shaded.
+        order = sorted(range(len(surfaces)), key=lambda k: _extent(surfaces[k].points))
+        corners = [(starts[k] + surfaces[k].corners).astype(np.int32) for k in order]
         with gl.context as context:
             layout = ("3f 3f 3f 1i", "position", "normal", "color", "geometry")
             self._vertices = None
-            if len(corners):
-                buffer, indices = context.buffer(shared.tobytes()), context.buffer(order.astype(np.int32).tobytes())
+            if len(vertices):
+                buffer, indices = context.buffer(vertices.tobytes()), context.buffer(np.concatenate(corners).tobytes())
                 self._vertices = context.vertex_array(gl.program, [(buffer, *layout)], indices)
             self._poses = context.texture((4, max(len(surfaces), 1)), 4, dtype="f4")
 
@@ -341,6 +340,11 @@ class _Stage:
         return self.gl.pixels(width, height)
 
 
+def _extent(points: np.ndarray) -> float:
+    """The longest side of the box that holds them."""
+    return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+
+
 # ---------------------------------------------------------------- surfaces
 
 
@@ -363,25 +367,21 @@ def _surface(shape: Shape, color: Sequence[float]) -> Triangles | None:
         if path is None or Path(path).suffix.lower() != ".obj":
             return None
         scale = np.array(shape.scale3())
-        points, normals, colors = read_obj(str(path), os.path.getmtime(path))
+        points, normals, colors, corners = read_obj(str(path), os.path.getmtime(path))
         points, normals = points * scale, normals / scale
-        if np.prod(scale) < 0:
-            points, normals, colors = (_backwards(part) for part in (points, normals, colors))
+        if np.prod(scale) < 0:  # the other way round: a mirrored triangle would be seen from inside
+            corners = corners.reshape(-1, 3)[:, ::-1].ravel()
         colors = np.where(np.isnan(colors), np.array(color), colors)
-        return _triangles(points, normals, colors)
+        return _triangles(points, normals, colors, corners)
     else:
         return None
-    return _triangles(points, normals, np.tile(color, (len(points), 1)))
+    shared, corners = np.unique(np.hstack([points, normals]), axis=0, return_inverse=True)
+    return _triangles(shared[:, :3], shared[:, 3:], np.tile(color, (len(shared), 1)), corners)
 
 
-def _triangles(points: np.ndarray, normals: np.ndarray, colors: np.ndarray) -> Triangles:
+def _triangles(points: np.ndarray, normals: np.ndarray, colors: np.ndarray, corners: np.ndarray) -> Triangles:
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return Triangles(*(np.ascontiguousarray(part, np.float32) for part in (points, normals, colors)))
-
-
-def _backwards(corners: np.ndarray) -> np.ndarray:
-    """Every triangle the other way round: a mirrored one would be seen from inside."""
-    return corners.reshape(-1, 3, 3)[:, ::-1].reshape(-1, 3)
+    return Triangles(*(np.ascontiguousarray(part, np.float32) for part in (points, normals, colors)), corners)
 
 
 def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -444,9 +444,11 @@ def _turned(profile: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, n
 
 
 @functools.lru_cache(maxsize=256)
-def read_obj(path: str, modified: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, normals and colours (3n, 3) of an OBJ's triangles; flat normals where it has none; NaN where its material
-    library says no colour (Kd)."""
+def read_obj(path: str, modified: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals and colours (m, 3) of the corners of an OBJ's triangles, and (3n,) which corner is where.
+
+    Normals are flat where it has none; colours are NaN where its material library says none (Kd).
+    """
     points, normals, faces, colors = [], [], [], []
     color, materials = (np.nan,) * 3, {}
     for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
@@ -465,20 +467,22 @@ def read_obj(path: str, modified: float) -> tuple[np.ndarray, np.ndarray, np.nda
         elif word == "usemtl":
             color = materials.get(rest.strip(), (np.nan,) * 3)
     if not faces:
-        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int)
     P = np.array(" ".join(" ".join(row.split()[:3]) for row in points).split(), float).reshape(-1, 3)
     N = np.array(" ".join(normals).split(), float).reshape(-1, 3)
     distinct: dict[str, int] = {}
     order = np.array([distinct.setdefault(corner, len(distinct)) for corner in faces])
     parts = [(corner.split("/") + ["", ""])[:3] for corner in distinct]
-    at = np.array([_index(part[0], len(P)) for part in parts])[order]
-    normal_at = np.array([_index(part[2], len(N)) if part[2] else -1 for part in parts])[order]
-    out = P[at]
+    at = np.array([_index(part[0], len(P)) for part in parts])
+    normal_at = np.array([_index(part[2], len(N)) if part[2] else -1 for part in parts])
+    if (normal_at >= 0).all() and len(set(colors)) == 1:  # corners of one name are one
+        return P[at], N[normal_at], np.tile(colors[0], (len(at), 1)), order
+    out, normal_at = P[at][order], normal_at[order]
     corners = out.reshape(-1, 3, 3)
     flat = np.repeat(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 3, axis=0)
     given = normal_at >= 0
     flat[given] = N[normal_at[given]]
-    return out, flat, np.repeat(np.array(colors), 3, axis=0)
+    return out, flat, np.repeat(np.array(colors), 3, axis=0), np.arange(len(out))
 
 
 def _index(text: str, count: int) -> int:

@@ -2,13 +2,16 @@
 physics and once for the cameras to render, and by pictures in the documents."""
 
 import dataclasses as dc
+import functools
+from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Box
+from pydrake.geometry import Box, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
+from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from valve_drake import resources
 from valve_drake.frames import make, rot_y, rot_z
@@ -32,6 +35,31 @@ def parse(plant: MultibodyPlant, model: str) -> ModelInstanceIndex:
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(resources.models() / "package.xml"))
     return parser.AddModels(str(resources.models() / model / f"{model}.sdf"))[0]
+
+
+@dc.dataclass(frozen=True)
+class Model:
+    """The controllers' model of the world, apart from the simulated plant: the robot, and a valve that is free."""
+
+    diagram: Diagram
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    robot: ModelInstanceIndex
+    valve: ModelInstanceIndex
+
+
+def model() -> Model:
+    """The controllers' model. All who ask share it, each with a Context of its own."""
+    return _model(resources.models())
+
+
+@functools.lru_cache(maxsize=1)
+def _model(folder: Path) -> Model:
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    robot, valve = parse(plant, "robot"), parse(plant, "valve")
+    plant.Finalize()
+    return Model(builder.Build(), plant, scene_graph, robot, valve)
 
 
 def panel_pose(valve: ValveConfig) -> np.ndarray:

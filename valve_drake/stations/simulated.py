@@ -7,7 +7,7 @@ of the robot alone. `truth.*` ports exist here only; the recorder alone reads th
 
 import dataclasses as dc
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydrake.common.value import Value
@@ -327,6 +327,14 @@ def make_mounts(head: StereoHead, simulation: SimulationConfig, seed: int) -> di
     }
 
 
+def rig_arguments(
+    simulation: SimulationConfig, marker_size: tuple[float, float], head: StereoHead, seed: int
+) -> tuple[Any, ...]:
+    """The arguments of CameraRig, or of CameraWorkers, for the station's cameras."""
+    mounts = make_mounts(head, simulation, seed)
+    return mounts, simulation.valve, marker_size, simulation.light, simulation.camera, seed
+
+
 @dc.dataclass(frozen=True)
 class Joints:
     """Where joints lie in the plant's state and actuation."""
@@ -366,7 +374,7 @@ def make_simulated_station(
 ) -> Diagram:
     """The station as a Diagram. simulation: resolved (no distributions left); home: both arms (12,) [rad].
 
-    workers: make the images there; else they are made when they are read.
+    workers: of `rig_arguments`, make the images; else they are made when they are read.
     """
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
@@ -436,8 +444,7 @@ def make_simulated_station(
         builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
 
     camera = simulation.camera
-    rig = (make_mounts(head, simulation, seed), valve, marker_size, simulation.light, camera, seed)
-    images = CameraRig(*rig) if workers is None else workers.start(*rig)
+    images = CameraRig(*rig_arguments(simulation, marker_size, head, seed)) if workers is None else workers
     positions = builder.AddSystem(MatrixGain(np.eye(plant.num_positions(), plant.num_multibody_states())))
     positions.set_name("positions")
     builder.Connect(plant.get_state_output_port(), positions.get_input_port())

@@ -77,8 +77,8 @@ STARTING = 3.0  # the first images take longer on a busy machine: it is told [s]
 class LiveImages(CameraWorkers):
     """Images made when they are captured, if somebody wants them, and fetched when they are ready; nobody waits."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, *rig: Any) -> None:
+        super().__init__(*rig)
         self.wanted: set[str] = set()
         self._unmade = set(CAMERAS)  # whose first image, that nobody has asked for, is not there yet
 
