@@ -7,11 +7,12 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from valve_drake import scenario as scenarios
+from valve_drake.camera.lens import Lens, OpenCvLens
 from valve_drake.diagram import initial_commands, make_station
 from valve_drake.frames import apply, compose, inverse, make, planar
 from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import SIDES
-from valve_drake.stations import contract, simulated
+from valve_drake.stations import camera_rig, contract, simulated
 from valve_drake.stations.scene import panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, StartConfig, ValveConfig
 
@@ -209,6 +210,20 @@ def test_a_rendered_marker_lies_where_the_lens_says_to_a_twentieth_of_a_pixel(ca
     fitted = fitted[[int(np.argmin(((fitted - p) ** 2).sum(-1))) for p in true]]
     assert np.linalg.norm((fitted - true).mean(axis=0)) < 0.03  # half a pixel of convention would show at once
     assert np.linalg.norm(fitted - true, axis=1).max() < 0.1
+
+
+def test_a_head_with_opencv_lenses_renders_what_the_same_head_with_the_papers_lenses_renders():
+    """`calibrate stereo` writes OpenCV's lenses: a calibration of one's own may be the simulated robot's, too."""
+    images = []
+    for lens in (
+        Lens(k_u=0.0, k_v=0.0, k_x=1082.3, k_y=1067.8, u_0=324.6, v_0=248.3),
+        OpenCvLens(np.array([[1082.3, 0, 324.6], [0, 1067.8, 248.3], [0, 0, 1]]), np.zeros(5)),
+    ):
+        image = np.zeros((800, 1200, 4), np.uint8)
+        image[::7, ::5] = 255
+        images.append(camera_rig._Lensed(lens)(image))
+    assert images[0].any()
+    np.testing.assert_array_equal(*images)
 
 
 def test_a_camera_that_nobody_reads_is_not_rendered_and_a_late_reader_sees_the_capture(monkeypatch):

@@ -84,6 +84,15 @@ class Canvas:
             out[near] += joint * light[(i + 2) % 4][near] * light[(i + 3) % 4][near]
         return out, box
 
+    def seen(
+        self, X_CS: np.ndarray, half: tuple[float, float], box: tuple[slice, slice] | None = None
+    ) -> tuple[np.ndarray, tuple[slice, slice]]:
+        """As `coverage`, of a rectangle in sight. Raises ValueError for one out of sight."""
+        covered = self.coverage(X_CS, half, box)
+        if covered is None:
+            raise ValueError("the rectangle is out of the camera's sight")
+        return covered
+
     def off_corners(
         self, X_CS: np.ndarray, half: tuple[float, float], box: tuple[slice, slice], margin: float
     ) -> np.ndarray:

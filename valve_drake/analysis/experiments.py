@@ -12,7 +12,7 @@ without what is less than 3 px off the corners: the usual bound for points along
 import dataclasses as dc
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -123,14 +123,13 @@ def information(X_LV: np.ndarray, eyes: StereoHead, marker: Marker, noise: float
     for lens, X_CL in zip(eyes.lenses(), _to_cameras(eyes)):
         canvas = Canvas(lens, BLUR)
         X_CV = frames.compose(X_CL, X_LV)
-        box = canvas.coverage(X_CV, half)[1]
+        box = canvas.seen(X_CV, half)[1]
         edge = canvas.off_corners(X_CV, half, box, 3.0).ravel()
 
         changes = []
         for step in np.diag(steps):
             there, back = (
-                canvas.coverage(frames.compose(X_CL, _moved(X_LV, sign * step)), half, box)[0].ravel()
-                for sign in (1, -1)
+                canvas.seen(frames.compose(X_CL, _moved(X_LV, sign * step)), half, box)[0].ravel() for sign in (1, -1)
             )
             changes.append(contrast * (there - back) / (2 * step.sum()))
         J = np.array(changes)
@@ -308,7 +307,7 @@ def _table3_row(
 
 
 def bound(
-    seed: int = 0, trials: int = 300, distances: tuple[float, ...] = DISTANCES, tilts: tuple[float, ...] = TILTS
+    seed: int = 0, trials: int = 300, distances: tuple[float, ...] = DISTANCES, tilts: tuple[int, ...] = TILTS
 ) -> dict[str, Any]:
     """Error over the bound: sqrt(mean(e^T F e) / 6) of each method, 1 at best; and the NEES / 6 of `refined`.
     Column `edge bound`: `refined` against the bound of the pixels 3 px off the corners.
@@ -337,7 +336,7 @@ def bound(
 
 
 def _bound_cells(
-    seed: int, trials: int, distances: tuple[float, ...], tilts: tuple[float, ...]
+    seed: int, trials: int, distances: tuple[float, ...], tilts: tuple[int, ...]
 ) -> Iterator[dict[str, Any]]:
     marker = Marker()
     for z in distances:
@@ -359,7 +358,7 @@ def _bound_cells(
                     edges = read(images, eyes, marker)[1]
                     _cell_errors(edges, X, eyes, marker, F, errors, peers=k % _LOOKS == 0)
             for cameras in ("one", "two"):
-                row = {"cameras": cameras, "z [m]": z, "tilt [deg]": tilt}
+                row: dict[str, Any] = {"cameras": cameras, "z [m]": z, "tilt [deg]": tilt}
                 for method in ("refined", "edge bound", "paper", "IPPE", "ITERATIVE", "corners", "NEES/6"):
                     values = errors.get((cameras, method))
                     row[method] = float((_root if method != "NEES/6" else np.mean)(values)) if values else None
@@ -368,7 +367,7 @@ def _bound_cells(
                 yield row | {"n": len(square)}
 
 
-def _root(values: list[float]) -> float:
+def _root(values: Sequence[float] | np.ndarray) -> float:
     return math.sqrt(np.mean(values))
 
 
@@ -429,7 +428,7 @@ def robustness(seed: int = 0, trials: int = 60, empty: int = 1000) -> dict[str, 
     """
     marker, eyes = Marker(), head()
     light = {"30 % darker": (0.7, 0.7, 0.7), "colour cast": (1.25, 1.0, 0.65)}
-    rows = []
+    rows: list[dict[str, Any]] = []
     for condition in (
         "plain",
         "half in shadow",
@@ -457,7 +456,12 @@ def robustness(seed: int = 0, trials: int = 60, empty: int = 1000) -> dict[str, 
             millimetres.append(1000 * shift)
             degrees.append(turn)
             squares.append(float(off @ np.linalg.solve(got.covariance, off)) / 6)
-        row = {"condition": condition, "n": trials, "found %": 100 * (len(degrees) + wrong) / trials, "wrong": wrong}
+        row: dict[str, Any] = {
+            "condition": condition,
+            "n": trials,
+            "found %": 100 * (len(degrees) + wrong) / trials,
+            "wrong": wrong,
+        }
         for name, values in (("mm", millimetres), ("deg", degrees)):
             at = [float(q) for q in np.quantile(values, [0.5, 0.95])] if values else [None, None]
             row |= {f"median {name}": at[0], f"95 % {name}": at[1]}

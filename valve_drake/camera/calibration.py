@@ -19,7 +19,7 @@ Frames: L, R cameras; C one camera; T board. Lengths in m, pixels as in lens.py.
 import dataclasses as dc
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ import numpy as np
 from valve_drake import frames
 from valve_drake.camera.board import Board
 from valve_drake.camera.least_squares import divided, minimize, skew, stepped, transform
-from valve_drake.camera.lens import KNOWN, Lens, LensModel, OpenCvLens, StereoHead, check_baseline
+from valve_drake.camera.lens import KNOWN, Lens, OpenCvLens, StereoHead, check_baseline
 from valve_drake.checks import ConfigError
 
 KINDS = ("opencv", "paper")
@@ -69,7 +69,7 @@ class Fit:
     """One lens model fitted to all views."""
 
     kind: str
-    lenses: tuple[LensModel, ...]
+    lenses: tuple[Lens | OpenCvLens, ...]
     X_LR: np.ndarray | None  # (3, 4), stereo only
     poses: tuple[np.ndarray, ...]  # X_LT of each body
     rms: float  # over corners, sqrt(mean(du^2 + dv^2)) as OpenCV has it [px]
@@ -111,6 +111,23 @@ class Calibration:
 
 
 # ---------------------------------------------------------------- lens models with their derivatives
+
+
+class _Kind(Protocol):
+    """A lens model whose m parameters are fitted."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+
+    def start(self, K: np.ndarray, dist: np.ndarray) -> np.ndarray:
+        """Parameters (m,) of about the same lens as OpenCV's K (3, 3) [px] and dist (5,)."""
+
+    def lens(self, p: np.ndarray, size: tuple[int, int]) -> Lens | OpenCvLens:
+        """The lens of parameters (m,); size: width, height [px]."""
+
+    def project(self, lens: Any, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """px (n, 2), d px / d xy (n, 2, 2), d px / d parameters (n, 2, m) of ideal xy (n, 2)."""
 
 
 class _OpenCvKind:
@@ -174,7 +191,7 @@ class _State:
 class _Problem:
     """Sum of squares of all corners' residuals, as a function of the lenses, X_LR and the bodies' poses."""
 
-    def __init__(self, views: Sequence[View], kind: Any, size: tuple[int, int]):
+    def __init__(self, views: Sequence[View], kind: _Kind, size: tuple[int, int]):
         self.views, self.kind, self.size = views, kind, size
         self.cameras = len(views[0].px)
         self.bodies = max(view.body for view in views) + 1
@@ -184,7 +201,8 @@ class _Problem:
     def __call__(self, state: _State) -> tuple[float, np.ndarray, np.ndarray, list[list[np.ndarray]]]:
         """Cost, its Gauss-Newton Hessian and gradient (halved), and the residuals."""
         n = self.shared + 6 * self.bodies
-        H, g, cost, residuals = np.zeros((n, n)), np.zeros(n), 0.0, []
+        H, g, cost = np.zeros((n, n)), np.zeros(n), 0.0
+        residuals: list[list[np.ndarray]] = []
         lenses = [self.kind.lens(p, self.size) for p in state.lenses]
         for view in self.views:
             X_LT = state.poses[view.body]
@@ -194,7 +212,7 @@ class _Problem:
             residuals.append([])
             for c, (lens, px) in enumerate(zip(lenses, view.px)):
                 Q, dQ, dX = P, dP, None
-                if c == 1:
+                if c == 1 and state.X_LR is not None:
                     R = state.X_LR[:, :3]
                     Q, dQ = (P - state.X_LR[:, 3]) @ R, R.T @ dP
                     dX = np.concatenate([skew(Q), np.broadcast_to(-R.T, (len(Q), 3, 3))], 2)
@@ -219,7 +237,7 @@ class _Problem:
 
     def moved(self, state: _State, step: np.ndarray) -> _State:
         lenses = tuple(p + step[c * self.m : (c + 1) * self.m] for c, p in enumerate(state.lenses))
-        X_LR = stepped(state.X_LR, step[self.shared - 6 : self.shared]) if self.cameras == 2 else None
+        X_LR = None if state.X_LR is None else stepped(state.X_LR, step[self.shared - 6 : self.shared])
         poses = step[self.shared :].reshape(-1, 6)
         return _State(lenses, X_LR, tuple(stepped(X, s) for X, s in zip(state.poses, poses)))
 
@@ -230,7 +248,7 @@ class _Problem:
         return (*out, *(f"X_LR.{name}" for name in ("theta_x", "theta_y", "theta_z", "p_x", "p_y", "p_z")))
 
 
-def _solve(views: Sequence[View], kind: Any, name: str, start: _State, size: tuple[int, int]) -> Fit:
+def _solve(views: Sequence[View], kind: _Kind, name: str, start: _State, size: tuple[int, int]) -> Fit:
     problem = _Problem(views, kind, size)
     state, (cost, H, _, residuals) = minimize(problem, start, problem.moved)
     corners = sum(len(r) for view in residuals for r in view)
@@ -272,9 +290,10 @@ def board_views(
     distances: Sequence[float] | None = None,
 ) -> list[View]:
     """Views of those boards that every camera found; with distances [m] all of them are one rigid target."""
-    views = []
-    for k, (name, px) in enumerate(zip(names, corners)):
-        if any(one is None for one in px):
+    views: list[View] = []
+    for k, (name, corners_of_each) in enumerate(zip(names, corners)):
+        px = tuple(found for found in corners_of_each if found is not None)
+        if len(px) < len(corners_of_each):
             continue
         points, body = board.points(), len(views)
         if distances is not None:
@@ -298,8 +317,8 @@ def calibrate(
     sets = _FRONTAL_TERMS if rigid else _TERMS
     start = _start(views, size, _OpenCvKind(sets[0]), rigid, board)
     views = start.views
-    kinds = {"opencv": _OpenCvKind(sets[0]), "paper": _PaperKind()}
-    fits = {}
+    kinds: dict[str, _Kind] = {"opencv": _OpenCvKind(sets[0]), "paper": _PaperKind()}
+    fits: dict[str, Fit] = {}
     for name, model in kinds.items():
         lenses = tuple(model.start(K, dist) for K, dist in start.lenses)
         try:
@@ -338,9 +357,13 @@ def _free(fit: Fit) -> list[int]:
     return [k for k, name in enumerate(_COEFFICIENTS) if name in own]
 
 
+def _opencv_lenses(fit: Fit) -> list[OpenCvLens]:
+    return [lens for lens in fit.lenses if isinstance(lens, OpenCvLens)]
+
+
 def _folds(fit: Fit) -> bool:
     """Whether some lens of an OpenCV fit does not map its whole image one to one."""
-    return any(reach < corner for reach, corner in (lens.radial_reach() for lens in fit.lenses))
+    return any(reach < corner for reach, corner in (lens.radial_reach() for lens in _opencv_lenses(fit)))
 
 
 def _determined(full: Fit, views: Sequence[View], sets: Sequence[Sequence[int]], size: tuple[int, int]) -> Fit:
@@ -405,14 +428,15 @@ def _sigma_maps(opencv: Fit, fit: Fit, views: Sequence[View], size: tuple[int, i
     """
     kind = _OpenCvKind(range(5))
     problem = _Problem(views, kind, size)
-    fitted = [np.concatenate([np.diag(lens.K)[:2], lens.K[:2, 2], lens.dist]) for lens in opencv.lenses]
+    lenses = _opencv_lenses(opencv)
+    fitted = [np.concatenate([np.diag(lens.K)[:2], lens.K[:2, 2], lens.dist]) for lens in lenses]
     cost, H, _, residuals = problem(_State(tuple(fitted), opencv.X_LR, opencv.poses))
     corners = sum(len(r) for view in residuals for r in view)
     H = H / max(cost / max(2 * corners - len(H), 1), 1e-12)
     u, v = np.meshgrid(np.linspace(0, size[0] - 1, _MAP[1]), np.linspace(0, size[1] - 1, _MAP[0]))
     grid = np.stack([u, v], -1).reshape(-1, 2)
     free = _free(opencv)
-    for c, lens in enumerate(opencv.lenses):
+    for c, lens in enumerate(lenses):
         reach = np.linalg.norm(lens.normalize(np.array([[0.0, 0.0], size])), axis=1).max()
         for k in set(range(5)) - set(free):
             at = c * len(kind.names) + 4 + k
@@ -420,7 +444,7 @@ def _sigma_maps(opencv: Fit, fit: Fit, views: Sequence[View], size: tuple[int, i
     scale = np.sqrt(np.diag(H)) + 1e-150
     inverse = np.linalg.pinv(H / np.outer(scale, scale), rcond=1e-15, hermitian=True) / np.outer(scale, scale)
     maps = []
-    for c, (lens, chosen) in enumerate(zip(opencv.lenses, fit.lenses)):
+    for c, (lens, chosen) in enumerate(zip(lenses, fit.lenses)):
         own = slice(c * len(kind.names), (c + 1) * len(kind.names))
         C = inverse[own, own]
         seen = np.vstack([view.px[c] for view in views])
@@ -514,6 +538,7 @@ def _one_right_camera(
         cost = float(np.minimum(nearest, _APART).sum()) + 1e-3 * distance(np.eye(3, 4), X, scale)
         if best is None or cost < best[0]:
             best = cost, X
+    assert best is not None  # there is a board in each view
     X_LR = best[1]
     off = [[distance(X_LR, other, scale) for other in one] for one in candidates]
     return X_LR, [turns[int(np.argmin(one))] for one in off], [min(one) > _APART for one in off]
@@ -572,7 +597,7 @@ def _criterion(fit: Fit, more: float, parameters: int) -> float:
 
 def parameters(fit: Fit) -> dict[str, float]:
     """Value of each lens parameter, named as in `Fit.names`."""
-    out = {}
+    out: dict[str, float] = {}
     for side, lens in zip(("left.", "right.") if len(fit.lenses) == 2 else ("",), fit.lenses):
         if isinstance(lens, Lens):
             values = {name: getattr(lens, name) for name in _PaperKind.names}
@@ -592,7 +617,8 @@ def _sights(fit: Fit, distance: float) -> tuple[np.ndarray, np.ndarray]:
 
     Points that a camera does not see are left out.
     """
-    R, p = fit.X_LR[:, :3], fit.X_LR[:, 3]
+    X_LR = fit.head().X_LR
+    R, p = X_LR[:, :3], X_LR[:, 3]
     ahead = (np.array([0, 0, 1]) + R[:, 2]) / np.linalg.norm(np.array([0, 0, 1]) + R[:, 2])
     side, up = np.meshgrid([-0.1, 0, 0.1], [-0.1, 0, 0.1])
     P = p / 2 + distance * (ahead + np.stack([side, up, 0 * up], -1).reshape(-1, 3))
@@ -618,7 +644,7 @@ def triangulate_all(head: StereoHead, left: np.ndarray, right: np.ndarray) -> np
 
 
 def _split_half(
-    fit: Fit, views: Sequence[View], kind: Any, size: tuple[int, int], least: int
+    fit: Fit, views: Sequence[View], kind: _Kind, size: tuple[int, int], least: int
 ) -> dict[float, float] | None:
     """Rms difference of the distances triangulated by the calibrations from the odd and from the even views [m].
 
@@ -649,7 +675,7 @@ def kind_parameters(fit: Fit) -> list[np.ndarray]:
     return list(np.array([values[name] for name in names]).reshape(len(fit.lenses), -1))
 
 
-def _depth_sigma(fit: Fit, kind: Any, size: tuple[int, int]) -> dict[float, float]:
+def _depth_sigma(fit: Fit, kind: _Kind, size: tuple[int, int]) -> dict[float, float]:
     """Standard deviation of the depth of a point in the middle of the common view, by the covariance [m]."""
     problem = _Problem([View(("", ""), np.zeros((0, 3)), (np.zeros((0, 2)),) * 2, 0)], kind, size)
     state = _State(tuple(kind_parameters(fit)), fit.X_LR, (np.eye(3, 4),))
@@ -667,7 +693,9 @@ def _depth_sigma(fit: Fit, kind: Any, size: tuple[int, int]) -> dict[float, floa
                 step = np.zeros(problem.shared + 6)
                 step[k] = sign * s
                 there = problem.moved(state, step)
-                head = StereoHead(*(kind.lens(p, size) for p in there.lenses), there.X_LR)
+                left, right = (kind.lens(p, size) for p in there.lenses)
+                assert there.X_LR is not None
+                head = StereoHead(left, right, there.X_LR)
                 depth.append(triangulate_all(head, *middle)[0, 2])
             J.append((depth[1] - depth[0]) / (2e-3 * s) if s > 0 else 0.0)
         out[distance] = float(np.sqrt(np.array(J) @ fit.covariance @ np.array(J)))

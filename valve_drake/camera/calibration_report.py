@@ -97,7 +97,8 @@ def _corners(
     paths: Sequence[tuple[Path, ...]], board: Board
 ) -> tuple[list[tuple[np.ndarray | None, ...]], tuple[int, int]]:
     """The corners in every image, and the size that all images have. One image at a time is held in memory."""
-    corners, first = [], None
+    corners: list[tuple[np.ndarray | None, ...]] = []
+    first: tuple[int, ...] = ()  # height and width of the first image
     with console(stderr=True).status("") if sys.stderr.isatty() else contextlib.nullcontext() as status:
         for k, pair in enumerate(paths):
             px = []
@@ -105,7 +106,7 @@ def _corners(
                 if status is not None:
                     status.update(f"looking for the board in {path.name} ({k + 1} of {len(paths)})")
                 image = read_image(path, cv2.IMREAD_GRAYSCALE)
-                first = image.shape if first is None else first
+                first = first or image.shape
                 if image.shape != first:
                     (h, w), (height, width) = image.shape, first
                     raise ConfigError(f"image {path}: {w} x {h}, but {paths[0][0].name} is {width} x {height}")
@@ -131,8 +132,9 @@ def calibrated(pictures: Pictures, board: Board, kind: str, distances: Sequence[
 def _report(command: str, result: cal.Calibration, pictures: Pictures, board: Board, out: Path) -> Report:
     fit, both = result.fit, len(result.fit.lenses) == 2
     values, sigmas, outliers = cal.parameters(fit), fit.sigmas(), fit.outliers()
-    if both:
-        pose = named(frames.rotation_vector(fit.X_LR[:, :3]), fit.X_LR[:, 3])
+    X_LR = fit.X_LR
+    if X_LR is not None:
+        pose = named(frames.rotation_vector(X_LR[:, :3]), X_LR[:, 3])
         values |= {f"X_LR.{name}": value for name, value in pose.items()}
     rms = fit.view_rms()
     tilts = np.degrees(cal.tilts(fit))
@@ -173,17 +175,19 @@ def _report(command: str, result: cal.Calibration, pictures: Pictures, board: Bo
                 "the board looks the same after half a turn: its corners are numbered so that the pairs agree; "
                 "one with an odd and an even number of corners leaves no doubt"
             )
-    if both:
+    if X_LR is not None:
         n = len(sigmas)
         spread = np.sqrt(np.diag(fit.covariance))[n - 6 :]
         numbers |= {
-            "X_LR": fit.X_LR.tolist(),
+            "X_LR": X_LR.tolist(),
             "X_LR_sigma": {"rotation_deg": np.degrees(spread[:3]).tolist(), "position_mm": (1e3 * spread[3:]).tolist()},
-            "baseline_mm": 1e3 * float(np.linalg.norm(fit.X_LR[:, 3])),
+            "baseline_mm": 1e3 * float(np.linalg.norm(X_LR[:, 3])),
             "split_half_mm": None,
             "depth_sigma_mm": {f"{z:g}": 1e3 * s for z, s in result.depth_sigma.items()},
-            "triangulated_pitch": {"mean": result.pitch[0], "standard_deviation": result.pitch[1]},
         }
+        if result.pitch is not None:
+            mean, deviation = result.pitch
+            numbers["triangulated_pitch"] = {"mean": mean, "standard_deviation": deviation}
         if result.split_half is None:
             warnings.append("too few pairs for the split-half difference")
         else:

@@ -6,7 +6,7 @@ refused by its name, since it may be a misspelt one, and so is a model that is n
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 
@@ -240,7 +240,7 @@ def _lens(K: np.ndarray, D: np.ndarray, size: list[Any], key: str) -> OpenCvLens
     return lens
 
 
-def _head(lenses: list[LensModel], X_LR: np.ndarray, key: str) -> StereoHead:
+def _head(lenses: Sequence[LensModel], X_LR: np.ndarray, key: str) -> StereoHead:
     head = StereoHead(lenses[0], lenses[1], X_LR)
     check_baseline(head, key)
     return head

@@ -310,7 +310,7 @@ def _gridded(
 
     The prior is flat in the logarithm of the arm's and the corners' variance together, and has a point mass at 0.
     """
-    lines = [np.linspace(*side, _STEPS) for side in window]
+    lines = [np.linspace(low, high, _STEPS) for low, high in window]
     floors = _VISIBLE * _corner_variances(V)
     each = [np.array([0.0, *np.maximum(np.exp(line) - floor, 0.0)]) for line, floor in zip(lines, floors)]
     variances = np.stack([one.ravel() for one in np.meshgrid(*each, indexing="ij")], 1)

@@ -46,14 +46,20 @@ class LensModel(Protocol):
     def project(self, xy: np.ndarray) -> np.ndarray:
         """Ideal xy (..., 2) -> raw px (..., 2)."""
 
+    def magnification(self) -> tuple[float, float]:
+        """Pixels for one unit of xy near the image's centre, along u and along v [px]."""
+
     def focal(self) -> float:
-        """Pixels for one unit of xy near the image's centre (mean of both directions) [px]."""
+        """The geometric mean of `magnification` [px]."""
 
     def sigma(self, px: np.ndarray) -> np.ndarray:
         """Standard deviation of where the lens puts a point seen at raw px (..., 2): (...,) [px]; 0 if not known.
 
         It is that of the calibration: small where its boards were, large where they were not.
         """
+
+    def __hash__(self) -> int:
+        """Lenses are immutable: what is computed from one may be cached by it."""
 
 
 @dc.dataclass(frozen=True)
@@ -119,6 +125,9 @@ class Lens:
         out = np.empty(np.shape(xy))
         out[..., 0], out[..., 1] = u / (1 + self.k_u * rr) + self.u_0, v / (1 + self.k_v * rr) + self.v_0
         return out
+
+    def magnification(self) -> tuple[float, float]:
+        return self.k_x, self.k_y
 
     def focal(self) -> float:
         return float(np.sqrt(self.k_x * self.k_y))
@@ -205,6 +214,9 @@ class OpenCvLens:
         points = np.column_stack([flat, np.ones(len(flat))])
         px = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.K, self.dist)[0]
         return px.reshape(np.shape(xy))
+
+    def magnification(self) -> tuple[float, float]:
+        return float(self.K[0, 0]), float(self.K[1, 1])
 
     def focal(self) -> float:
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))

@@ -22,7 +22,7 @@ import operator
 import struct
 import typing
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -33,7 +33,7 @@ from valve_drake import messages
 from valve_drake.messages import Message, array
 
 PACKAGE = "valve_drake"
-UNLOGGED = {messages.CameraFrame: ("image", "data")}
+UNLOGGED: dict[type[Message], tuple[str, ...]] = {messages.CameraFrame: ("image", "data")}
 
 _Field = descriptor_pb2.FieldDescriptorProto
 _ONE_BYTE = [bytes([n]) for n in range(256)]
@@ -72,13 +72,13 @@ class Encoded(NamedTuple):
     data: bytes
 
 
-Loggable = Message | Proto | Encoded
+Loggable: TypeAlias = Message | Proto | Encoded
 
 
 @dc.dataclass(frozen=True)
 class _FieldCodec:
     name: str
-    type: int  # of descriptor_pb2.FieldDescriptorProto
+    proto_type: int  # a TYPE_... of descriptor_pb2.FieldDescriptorProto
     repeated: bool
     put: Callable[[Any], bytes]  # the field's value as protobuf's bytes, without a tag
     from_proto: Callable[[Any], Any]
@@ -90,7 +90,7 @@ class _FieldCodec:
 class _Codec:
     proto: type[Proto]
     fields: tuple[_FieldCodec, ...]
-    values: Callable[[Message], tuple]  # of all fields
+    values: Callable[[Message], tuple[Any, ...]]  # of all fields
     writers: tuple[Callable[[Any], bytes], ...]  # for each: value -> bytes with tags
 
 
@@ -168,17 +168,27 @@ def _kinds() -> dict[str, type[Message]]:
     return found
 
 
-@functools.cache
+_codecs: dict[type[Message], _Codec] = {}
+
+
 def _codec(kind: type[Message]) -> _Codec:
+    codec = _codecs.get(kind)
+    if codec is None:
+        codec = _codecs[kind] = _make_codec(kind)
+    return codec
+
+
+def _make_codec(kind: type[Message]) -> _Codec:
     hints = typing.get_type_hints(kind)
     logged = [f for f in dc.fields(kind) if f.name not in UNLOGGED.get(kind, ())]
     fields = tuple(_field_codec(kind, f, hints[f.name]) for f in logged)
     file = descriptor_pb2.FileDescriptorProto(name=f"{PACKAGE}/{kind.__name__}.proto", package=PACKAGE, syntax="proto3")
-    file.dependency.extend(sorted({proto_class(f.nested).DESCRIPTOR.file.name for f in fields if f.nested}))
+    inner = [f.nested for f in fields if f.nested is not None]
+    file.dependency.extend(sorted({proto_class(nested).DESCRIPTOR.file.name for nested in inner}))
     message = file.message_type.add(name=kind.__name__)
     for number, field in enumerate(fields, start=1):
         label = _Field.LABEL_REPEATED if field.repeated else _Field.LABEL_OPTIONAL
-        declared = message.field.add(name=field.name, number=number, type=field.type, label=label)
+        declared = message.field.add(name=field.name, number=number, type=field.proto_type, label=label)
         if field.nested:
             declared.type_name = f".{PACKAGE}.{field.nested.__name__}"
     _POOL.Add(file)
@@ -187,12 +197,12 @@ def _codec(kind: type[Message]) -> _Codec:
     return _Codec(message_factory.GetMessageClass(descriptor), fields, _getter(fields), writers)
 
 
-def _getter(fields: tuple[_FieldCodec, ...]) -> Callable[[Message], tuple]:
+def _getter(fields: tuple[_FieldCodec, ...]) -> Callable[[Message], tuple[Any, ...]]:
     get = operator.attrgetter(*(f.name for f in fields))
     return get if len(fields) > 1 else lambda message: (get(message),)
 
 
-def _field_codec(kind: type[Message], field: dc.Field, hint: Any) -> _FieldCodec:
+def _field_codec(kind: type[Message], field: dc.Field[Any], hint: Any) -> _FieldCodec:
     if "shape" in field.metadata:
         return _array_codec(kind, field)
     repeated = typing.get_origin(hint) is tuple
@@ -200,15 +210,18 @@ def _field_codec(kind: type[Message], field: dc.Field, hint: Any) -> _FieldCodec
     nested = inner if isinstance(inner, type) and issubclass(inner, Message) else None
     if nested is None and (inner not in _SCALARS or (repeated and inner is not str)):
         raise TypeError(f"{kind.__name__}.{field.name}: no protobuf for {hint}")
-    if nested:
-        number, put, back = _Field.TYPE_MESSAGE, encode, functools.partial(from_proto, inner)
+    number: int
+    put: Callable[[Any], bytes]
+    back: Callable[[Any], Any]
+    if nested is not None:
+        number, put, back = _Field.TYPE_MESSAGE, encode, functools.partial(from_proto, nested)
     else:
         number, put, back = _SCALARS[inner]
     from_field = (lambda values: tuple(back(value) for value in values)) if repeated else back
     return _FieldCodec(field.name, number, repeated, put, from_field, nested=nested)
 
 
-def _array_codec(kind: type[Message], field: dc.Field) -> _FieldCodec:
+def _array_codec(kind: type[Message], field: dc.Field[Any]) -> _FieldCodec:
     shape, optional = field.metadata["shape"], field.metadata["optional"]
     if shape.count(-1) > (0 if optional else 1):
         # Its length could not be told from the number of values, or no rows from None.
@@ -236,8 +249,8 @@ def _varint(n: int) -> bytes:
 def _writer(number: int, field: _FieldCodec) -> Callable[[Any], bytes]:
     """A field's value as tag and bytes; nothing for zeros and empty ones, as proto3 has it."""
     put = field.put
-    sized = field.repeated or field.type in (_Field.TYPE_STRING, _Field.TYPE_BYTES, _Field.TYPE_MESSAGE)
-    wire_type = 2 if sized else 1 if field.type == _Field.TYPE_DOUBLE else 0
+    sized = field.repeated or field.proto_type in (_Field.TYPE_STRING, _Field.TYPE_BYTES, _Field.TYPE_MESSAGE)
+    wire_type = 2 if sized else 1 if field.proto_type == _Field.TYPE_DOUBLE else 0
     tag = _varint(number << 3 | wire_type)
     head = tag + _varint(field.size or 0)
 
@@ -256,17 +269,17 @@ def _writer(number: int, field: _FieldCodec) -> Callable[[Any], bytes]:
         data = put(value)
         return tag + _varint(len(data)) + data
 
-    def each(values: tuple) -> bytes:
+    def each(values: tuple[Any, ...]) -> bytes:
         return b"".join([message(value) for value in values])
 
     if field.size:
         return of_fixed_size
-    if field.repeated and field.type != _Field.TYPE_DOUBLE:
+    if field.repeated and field.proto_type != _Field.TYPE_DOUBLE:
         return each
     if field.nested:
         return message
     return with_size if sized else plain
 
 
-for _kind in _kinds().values():
-    _codec(_kind)
+for _kind in _kinds().values():  # a field without a protobuf type fails when the package is imported
+    proto_class(_kind)

@@ -33,7 +33,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo
 
 from valve_drake import profiling
-from valve_drake.camera.lens import Lens, distortion_maps
+from valve_drake.camera.lens import LensModel, distortion_maps
 from valve_drake.frames import compose, make, rot_z
 from valve_drake.messages import CameraFrame
 from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer
@@ -48,7 +48,7 @@ MAP_BLUR = 0.4  # standard deviation of what the bilinear map blurs [px]
 class Mount:
     """One camera: its lens, the frame it sits on, and how far off that frame it really is (X_FC, (3, 4))."""
 
-    lens: Lens
+    lens: LensModel
     frame: str
     X_FC: np.ndarray
 
@@ -62,11 +62,11 @@ class _Lensed:
     bilinear: its weights for a point of the render sum to one over the image, so that no edge is moved.
     """
 
-    def __init__(self, lens: Lens):
+    def __init__(self, lens: LensModel):
         x, y = distortion_maps(lens, np.eye(3))  # the ray of every pixel: x/z and y/z
         c, s = np.cos(ROLL), np.sin(ROLL)
         self.X_CR = make(rot_z(ROLL), np.zeros(3))  # the render's camera in the image's
-        focal = max(lens.k_x, lens.k_y)
+        focal = max(lens.magnification())
         u, v = focal * (c * x + s * y), focal * (c * y - s * x)
         u0, v0 = np.floor(u.min()) - 1, np.floor(v.min()) - 1
         width, height = int(np.ceil(u.max()) + 2 - u0), int(np.ceil(v.max()) + 2 - v0)
@@ -223,11 +223,11 @@ def decode_image(data: bytes) -> np.ndarray:
 
 @dc.dataclass(frozen=True)
 class Capture:
-    """What a camera caught: when, which one, and the plant's positions then."""
+    """One exposure of a camera: when it was taken, its number, and the plant's positions at that time."""
 
-    time: float = -1.0
+    time: float = -1.0  # [s]; -1: nothing was captured yet
     sequence: int = -1
-    q: np.ndarray | None = None
+    q: np.ndarray = dc.field(default_factory=lambda: np.zeros(0))
 
 
 class Images(typing.Protocol):

@@ -73,9 +73,11 @@ class CameraWorkers:
             with there:
                 if rig is not None:
                     mine = [*(worker.wire for worker in self._workers), wire]
-                    self._workers.append(_Worker(*_fork(rig, there.fileno(), mine), wire))
+                    copy, wait = _fork(rig, there.fileno(), mine)
+                    self._workers.append(_Worker(copy, wait, wire))
                 else:
-                    self._workers.append(_Worker(*_spawn(there.fileno()), wire))
+                    process, wait = _spawn(there.fileno())
+                    self._workers.append(_Worker(process, wait, wire))
                     _send(wire, self._rig)
         return self
 

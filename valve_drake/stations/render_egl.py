@@ -242,7 +242,8 @@ class _OpenGL:
 
     def __init__(self) -> None:
         try:
-            self.context = moderngl.create_context(standalone=True, backend="egl", require=330)
+            # moderngl's stub asks for a dict for each setting.
+            self.context = moderngl.create_context(standalone=True, backend="egl", require=330)  # type: ignore[arg-type]
             self._egl = ctypes.CDLL("libEGL.so.1")
             self._egl.eglGetCurrentContext.restype = ctypes.c_void_p
             with self.context:
@@ -324,17 +325,20 @@ class _Stage:
         with self.gl.context as context:
             program, target = self.gl.program, self.gl.target(width, height)
             target.use()
-            target.clear(*clear[:3], 1.0)
+            red, green, blue = clear[:3]
+            target.clear(red, green, blue, 1.0)
             if self._vertices is not None:
                 context.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if cull else 0))
                 context.front_face = "cw"  # seen in the image's own orientation: its rows run downwards
                 self._poses.write(np.ascontiguousarray(poses.transpose(0, 2, 1)).tobytes())
                 self._poses.use(0)
                 for name, value in uniforms.items():
+                    uniform = program[name]
+                    assert isinstance(uniform, moderngl.Uniform)
                     if isinstance(value, bytes):
-                        program[name].write(value)
+                        uniform.write(value)
                     else:
-                        program[name].value = value
+                        uniform.value = value
                 self._vertices.render(moderngl.TRIANGLES)
             target.read_into(self.gl.pixels(width, height), components=4)
         return self.gl.pixels(width, height)
@@ -381,7 +385,8 @@ def _surface(shape: Shape, color: Sequence[float]) -> Triangles | None:
 
 def _triangles(points: np.ndarray, normals: np.ndarray, colors: np.ndarray, corners: np.ndarray) -> Triangles:
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return Triangles(*(np.ascontiguousarray(part, np.float32) for part in (points, normals, colors)), corners)
+    points, normals, colors = (np.ascontiguousarray(part, np.float32) for part in (points, normals, colors))
+    return Triangles(points, normals, colors, corners)
 
 
 def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -431,7 +436,8 @@ def _turned(profile: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, n
         out[..., 2] = rows[:, None, 1]
         return out
 
-    points, normals = [], []
+    points: list[np.ndarray] = []
+    normals: list[np.ndarray] = []
     for rows, directions in profile:
         for grid, into in ((around(rows), points), (around(directions), normals)):
             a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
@@ -449,8 +455,12 @@ def read_obj(path: str, modified: float) -> tuple[np.ndarray, np.ndarray, np.nda
 
     Normals are flat where it has none; colours are NaN where its material library says none (Kd).
     """
-    points, normals, faces, colors = [], [], [], []
-    color, materials = (np.nan,) * 3, {}
+    points: list[str] = []
+    normals: list[str] = []
+    faces: list[str] = []
+    colors: list[tuple[float, ...]] = []
+    color: tuple[float, ...] = (np.nan,) * 3
+    materials: dict[str, tuple[float, ...]] = {}
     for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
         word, _, rest = line.partition(" ")
         if word == "v":
