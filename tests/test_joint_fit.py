@@ -15,7 +15,7 @@ EYE, MARKER = experiments.head().left, Marker()
 
 
 def pose(z, tilt=0.5, roll=0.3):
-    return experiments._tilted(np.array([0.02, 0.01, z]), tilt, 0.7, roll)
+    return experiments.tilted(np.array([0.02, 0.01, z]), tilt, 0.7, roll)
 
 
 def canvas(X):

@@ -109,7 +109,7 @@ def _to_cameras(eyes: StereoHead) -> tuple[np.ndarray, np.ndarray]:
     return np.eye(3, 4), frames.inverse(eyes.X_LR)
 
 
-def _moved(X: np.ndarray, step: np.ndarray) -> np.ndarray:
+def moved(X: np.ndarray, step: np.ndarray) -> np.ndarray:
     """X after a step of (theta, dp)."""
     return frames.make(X[:, :3] @ frames.rotation(step[:3]), X[:, 3] + step[3:])
 
@@ -129,7 +129,7 @@ def information(X_LV: np.ndarray, eyes: StereoHead, marker: Marker, noise: float
         changes = []
         for step in np.diag(steps):
             there, back = (
-                canvas.seen(frames.compose(X_CL, _moved(X_LV, sign * step)), half, box)[0].ravel() for sign in (1, -1)
+                canvas.seen(frames.compose(X_CL, moved(X_LV, sign * step)), half, box)[0].ravel() for sign in (1, -1)
             )
             changes.append(contrast * (there - back) / (2 * step.sum()))
         J = np.array(changes)
@@ -348,7 +348,7 @@ def _bound_cells(
             errors: dict[tuple[Any, ...], list[Any]] = {}
             for _ in range(4):
                 roll = rng.uniform(-0.7, 0.7) if z >= 0.5 else rng.uniform(-0.15, 0.15)
-                base = _tilted(middle, math.radians(tilt), rng.uniform(0, 2 * math.pi), roll)
+                base = tilted(middle, math.radians(tilt), rng.uniform(0, 2 * math.pi), roll)
                 F = information(base, eyes, marker, NOISE)
                 for k in range(trials // 4):
                     if k % _LOOKS == 0:
@@ -371,7 +371,7 @@ def _root(values: Sequence[float] | np.ndarray) -> float:
     return math.sqrt(np.mean(values))
 
 
-def _tilted(p: np.ndarray, tilt: float, direction: float, roll: float) -> np.ndarray:
+def tilted(p: np.ndarray, tilt: float, direction: float, roll: float) -> np.ndarray:
     """X_LV at p, its normal `tilt` off the line of sight towards `direction`."""
     d = p / np.linalg.norm(p)
     sight = frames.rot_y(math.atan2(d[0], d[2])) @ frames.rot_x(-math.asin(d[1]))
@@ -483,7 +483,7 @@ def _somewhere(rng: np.random.Generator) -> np.ndarray:
     """A marker's pose that both cameras see, its X axis within 1 rad of level."""
     z = rng.uniform(0.6, 2.0)
     p = np.array([0.06 + 0.05 * (z - 0.4) * rng.uniform(-1, 1), 0.08 * (z - 0.4) * rng.uniform(-1, 1), z])
-    return _tilted(p, math.radians(rng.uniform(0, 40)), rng.uniform(0, 2 * math.pi), rng.uniform(-1, 1))
+    return tilted(p, math.radians(rng.uniform(0, 40)), rng.uniform(0, 2 * math.pi), rng.uniform(-1, 1))
 
 
 def _scene(
@@ -519,7 +519,7 @@ def _distractors(rng: np.random.Generator, X: np.ndarray | None, marker: Marker)
         p = np.array([0.06 + 0.22 * z * rng.uniform(-1, 1), 0.18 * z * rng.uniform(-1, 1), z])
         if X is not None and np.linalg.norm(p / z - X[:, 3] / X[2, 3]) < 0.16 / z + 0.24 / X[2, 3]:
             continue
-        pose = _tilted(p, math.radians(rng.uniform(0, 50)), rng.uniform(0, 2 * math.pi), rng.uniform(-1.5, 1.5))
+        pose = tilted(p, math.radians(rng.uniform(0, 50)), rng.uniform(0, 2 * math.pi), rng.uniform(-1.5, 1.5))
         red = tuple(np.array(RED) * rng.uniform(0.6, 1.3) + rng.uniform(0, 25, 3))
         kind = rng.integers(5)
         size = max(marker.size) / 2 * (rng.uniform(0.4, 0.75) if rng.random() < 0.5 else rng.uniform(1.25, 1.6))
@@ -538,12 +538,21 @@ def _distractors(rng: np.random.Generator, X: np.ndarray | None, marker: Marker)
 
 # ---------------------------------------------------------------- all of them
 
+
+def peers(seed: int = 0, trials: int = 100) -> dict[str, Any]:
+    """See `peers_experiment`, which draws and measures by what is in this module."""
+    from valve_drake.analysis import peers_experiment
+
+    return peers_experiment.peers(seed, trials)
+
+
 EXPERIMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     "hand-eye": hand_eye_experiment.hand_eye,
     "table2": table2,
     "table3": table3,
     "bound": bound,
     "robustness": robustness,
+    "peers": peers,
 }
 
 
