@@ -45,7 +45,7 @@ class Divergence(NamedTuple):
 
 @dc.dataclass
 class TopicDifference:
-    """One topic; messages of the same time are held against each other."""
+    """The differences in one topic; messages of the same time are compared."""
 
     recorded: int = 0
     replayed: int = 0
@@ -160,7 +160,7 @@ class Comparison:
                 total.largest = change
 
     def _canonical(self, topic: str, data: bytes) -> bytes | None:
-        """Protobuf has several ways to write down the same message (refilled.py); this is its own.
+        """The message in protobuf's own encoding, so that bytes can be compared: there are several (refilled.py).
 
         None for the message of a program whose type of that name had other fields.
         """
@@ -171,7 +171,7 @@ class Comparison:
 
 
 def differences(a: Any, b: Any, path: str = "") -> list[tuple[str, Any, Any]]:
-    """Every field in which two messages differ, if only in a bit: its path and both values, None where one has none."""
+    """(path, value in a, value in b) of every field that differs in any bit; None where a message lacks it."""
     if isinstance(a, Message) and isinstance(b, Message):
         names = {**vars(a), **vars(b)}
     elif isinstance(a, Proto) and isinstance(b, Proto):

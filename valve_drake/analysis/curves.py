@@ -69,7 +69,7 @@ def _position_error(log: Traces) -> Plot:
 
 
 def _position(log: Traces) -> Plot:
-    """Without truth: the estimate in odometry's frame, minus its median: a marker at rest should not move."""
+    """Without truth: the estimate in odometry's frame minus its median, since a marker at rest should not move."""
     found = log.estimates
     lines: list[Line] = []
     if found is not None and len(found.time):

@@ -1,11 +1,10 @@
-"""Images drawn from geometry, exact to a thousandth of a pixel: what the experiments on the estimator look at.
+"""Images drawn from geometry, exact to a thousandth of a pixel, for the experiments on the estimator.
 
 Every pixel is the integral of a scene of flat shapes, blurred by the lens, over the pixel's square. Along a straight
 edge at the signed distance d that integral has a closed form: the step, convolved with a Gaussian and with the two
-boxes that a square is to an edge of normal (n_u, n_v). At a corner two edges meet; unless they are square to each
-other they depend on each other, as a bivariate normal distribution does, which is taken by its series. A renderer's
-anti-aliasing counts a few samples in each pixel and shifts whole sides by 0.02 px, ten times what the estimator can
-tell; nothing here is sampled.
+boxes of the pixel's projection onto the normal (n_u, n_v). At a corner two edges meet; unless they are perpendicular,
+their product is corrected by the series of the bivariate normal distribution. Nothing is sampled: a renderer's
+anti-aliasing takes a few samples in each pixel, which shifts whole sides by 0.02 px, ten times the estimator's error.
 """
 
 import functools
@@ -35,7 +34,7 @@ def _grid(lens: LensModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _second_integral(x: np.ndarray, s: float) -> np.ndarray:
-    """Of the blurred step Phi(x / s), twice over x."""
+    """The second integral over x of the blurred step Phi(x / s)."""
     phi = np.exp(-0.5 * (x / s) ** 2) / math.sqrt(2 * math.pi)
     return (x * x + s * s) / 2 * (1 + np.asarray(_ERF(x / (s * math.sqrt(2))), float)) / 2 + x * s / 2 * phi
 
@@ -87,7 +86,7 @@ class Canvas:
     def seen(
         self, X_CS: np.ndarray, half: tuple[float, float], box: tuple[slice, slice] | None = None
     ) -> tuple[np.ndarray, tuple[slice, slice]]:
-        """As `coverage`, of a rectangle in sight. Raises ValueError for one out of sight."""
+        """As `coverage`, for a rectangle in sight. Raises ValueError for one out of sight."""
         covered = self.coverage(X_CS, half, box)
         if covered is None:
             raise ValueError("the rectangle is out of the camera's sight")
@@ -110,13 +109,13 @@ class Canvas:
             g_u = line[0] * A[..., 0, 0] + line[1] * A[..., 1, 0]
             g_v = line[0] * A[..., 0, 1] + line[1] * A[..., 1, 1]
             slope = np.hypot(g_u, g_v)
-            # The lens turns the edge over the whole image only: one normal does for a side.
+            # A lens bends an edge noticeably only across the whole image: one normal is enough for a side.
             near = np.abs(xy - (q[i, :2] + q[j, :2]) / 2).sum(-1).argmin()
             n_u, n_v = (round(float(g.flat[near] / slope.flat[near]), 4) for g in (g_u, g_v))
             yield (xy @ line[:2] + line[2]) / slope, (n_u, n_v)
 
     def disc(self, X_CS: np.ndarray, color: tuple[float, ...], half: tuple[float, float]) -> None:
-        """An ellipse; its edge is nobody's measure, so the pixel's square counts as a little more blur."""
+        """An ellipse. Nothing is measured at its edge, so the pixel's square is approximated by a little more blur."""
         P = frames.apply(X_CS, _UNIT * [*half, 0])
         box = self._box(P)
         if box is None or min(box[0].stop - box[0].start, box[1].stop - box[1].start) < 2:

@@ -1,12 +1,12 @@
-"""The paper's experiments on the estimator done again, and its error against the least that any method can have.
+"""The paper's experiments on the estimator repeated, and its error over the least that any method can reach.
 
 Images are drawn (`drawn_images`), not rendered: a renderer's anti-aliasing shifts sides by more than the estimator's
 own error. Every experiment is deterministic in its seed and returns plain numbers: settings, and rows of a table.
 
 The bound (Cramer and Rao) is taken from the pixels: F = sum (dI/dx)(dI/dx)^T / sigma^2 over all pixels and colours of
-the cameras used, dI/dx the change of the exact image with the pose, sigma that of noise and rounding. It knows colours
-and blur and uses every pixel up to the corners, so no method on these images can be better. `edge bound` is the same
-without what is less than 3 px off the corners: the usual bound for points along the four sides.
+the cameras used, dI/dx the derivative of the exact image by the pose, sigma the noise with rounding. It assumes known
+colours and blur and uses every pixel up to the corners, so no method can do better on these images. `edge bound` leaves
+out pixels nearer than 3 px to a corner: the usual bound for points along the four sides.
 """
 
 import dataclasses as dc
@@ -31,11 +31,11 @@ from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
 from valve_drake.perception.stereo_positioning import StereoPositioningConfig, triangulate
 
-BLUR, NOISE = 0.7, 2.0  # of the lens [px], of a pixel's colour [grey levels], where nothing else is said
+BLUR, NOISE = 0.7, 2.0  # standard deviations, unless given: of the lens's blur [px], of a pixel's colour [grey levels]
 NOISES = (1.0, 2.0, 4.0)
 DISTANCES, TILTS = (0.3, 0.5, 0.8, 1.2, 1.8, 2.5), (0, 15, 30, 45)  # of `bound` [m], [deg]
-_LOOKS = 5  # images of one place in `bound`, each with its own noise
-# Drawn sides share no error: the allowance for renderers and real lenses would only make the covariance too large.
+_LOOKS = 5  # image pairs of one pose in `bound`, each with its own noise
+# Drawn images have no error that a whole side shares, so `side_bias` would only make the covariance too large.
 REFINED = RectangleEstimatorConfig(side_bias=0.0)
 PAPER = dc.replace(REFINED, method="paper")
 _CAMERAS = ("left", "right")
@@ -317,7 +317,7 @@ def bound(
     two mirrored tilts is right is told to every method alike (IPPE: the nearer pose).
 
     The mean of NEES / 6 over n pairs has a standard error of sqrt(2 / (6 n)): 0.033 for 300. Of 48 cells the extremes
-    are then expected at 1 +- 0.08, so that one outside 0.9 .. 1.1 is the covariance's fault and not chance's.
+    are then expected at 1 +- 0.08, so that a value outside 0.9 .. 1.1 means a wrong covariance, not chance.
     """
     rows = list(_bound_cells(seed, trials, distances, tilts))
     totals = {}
@@ -341,7 +341,7 @@ def _bound_cells(
     marker = Marker()
     for z in distances:
         eyes = head() if z >= 0.5 else converged(z)
-        # Between the eyes; near, where both images hold the target.
+        # Midway between the cameras; for near targets, a point that both cameras see.
         middle = np.array([0.06, 0, z]) if z >= 0.5 else np.array([0, -0.012, z])
         for tilt in tilts:
             rng = np.random.default_rng([seed, round(1000 * z), tilt])
@@ -397,7 +397,7 @@ def _cell_errors(
         return e
 
     for cameras, seen in (("one", one_camera(edges)), ("two", edges)):
-        # One camera's answer is no answer of two: images in which an eye failed count as missed (column n).
+        # If one camera's fit failed, the pair counts as missed (column n): a pose from one camera is not compared.
         needed = 1 + (cameras == "two")
         got = estimate(seen, eyes, marker, REFINED, Track(X))
         if got.found and got.cameras == needed:
@@ -421,10 +421,10 @@ def _cell_errors(
 
 
 def robustness(seed: int = 0, trials: int = 60, empty: int = 1000) -> dict[str, Any]:
-    """What is found of the valve's marker under bad conditions, with no word of where it is; and in scenes without it.
+    """How often the valve's marker is found, without a prior pose, in bad conditions and in scenes without it.
 
-    Wrong: called found, but more than 10 deg or 3 % of the distance off. NEES / 6 is the mean over the right ones, with
-    the default configuration: its `side_bias` allows for what drawn images do not have, so less than 1 is expected.
+    Wrong: reported as found, but more than 10 deg or 3 % of the distance off. NEES / 6 is the mean over the right ones,
+    with the default configuration. It is less than 1: `side_bias` allows for errors that drawn images do not have.
     """
     marker, eyes = Marker(), head()
     light = {"30 % darker": (0.7, 0.7, 0.7), "colour cast": (1.25, 1.0, 0.65)}
@@ -571,7 +571,7 @@ def plot_bound(result: dict[str, Any], file: Path | IO[bytes]) -> None:
     import matplotlib
 
     matplotlib.use("svg")
-    matplotlib.rcParams["svg.hashsalt"] = "valve_drake"  # the same file from the same numbers
+    matplotlib.rcParams["svg.hashsalt"] = "valve_drake"  # the same numbers give the same file
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")

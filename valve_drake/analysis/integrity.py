@@ -1,4 +1,4 @@
-"""Is a log whole? Damage, messages that are missing, and gaps against the rate that each topic should have."""
+"""Checks whether a log is complete: damage, missing messages, and gaps against each topic's expected rate."""
 
 import dataclasses as dc
 import math
@@ -123,7 +123,7 @@ def examine(log: LogReader) -> Integrity:
         schema, time = log.topics[name].schema, when / NANO
         if log.own and len(log.channels(name)) == 1:
             rows.append(_row(name, schema, time, number.astype(np.int64), log.start, log.end))
-        else:  # other programs number as they like, and have their own rates
+        else:  # the numbering and rates of other programs are not known
             rows.append(_foreign_row(name, schema, np.sort(time)))
     rows.sort(key=lambda row: row.topic)
     count = sum(row.count for row in rows)

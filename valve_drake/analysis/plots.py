@@ -1,7 +1,7 @@
-"""Plots over time as small inline SVG: no library, no network, text stays text, and the page's script can zoom them.
+"""Plots over time as small inline SVG: without a library or network, with searchable text, zoomed by the page's script.
 
-A plot is an outer SVG with the ticks, and an inner one whose user units are seconds across and pixels down: to zoom is
-to change its viewBox. Lines keep their width by `vector-effect`; points are lines of no length with round ends.
+A plot is an outer SVG with the ticks, and an inner one whose user units are seconds across and pixels down: the script
+zooms by changing its viewBox. Lines keep their width by `vector-effect`; points are lines of no length with round ends.
 """
 
 import dataclasses as dc
@@ -147,7 +147,7 @@ def nice_ticks(low: float, high: float, count: int) -> list[float]:
 
 
 def thin(time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fewer points that look the same: the least and the greatest value of every bucket of time, in order."""
+    """Fewer points that draw the same curve: the least and the greatest value of every bucket of time, in order."""
     if len(time) <= 2 * BUCKETS or time[-1] <= time[0]:
         return time, value
     bucket = np.minimum(((time - time[0]) / (time[-1] - time[0]) * BUCKETS).astype(int), BUCKETS - 1)

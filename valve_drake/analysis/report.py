@@ -1,6 +1,6 @@
 """Makes one self-contained HTML page of a log (or of two): it loads nothing from the network.
 
-`review` reads a log into facts, `page` and `comparison_page` make HTML of them, `facts` gives the same to programs.
+`review` reads a log, `page` and `comparison_page` make HTML of the result, `facts` makes the object of --json.
 """
 
 import dataclasses as dc
@@ -40,7 +40,7 @@ LONGEST = 48  # values are cut to this where two logs differ [characters]
 
 @dc.dataclass
 class Review:
-    """Everything that is known of one log."""
+    """What the page and the JSON of one log are made from."""
 
     log: LogReader
     traces: Traces
@@ -58,7 +58,7 @@ class Review:
 
 
 def review(path: str | os.PathLike[str]) -> Review:
-    """Reads a log, whatever its state. Raises ConfigError if it is none."""
+    """Reads a log, also a damaged one. Raises ConfigError if the file is no log."""
     log = LogReader(path)
     traces = Traces(log)
     run = dict(log.metadata.get("run", {}))
@@ -307,7 +307,7 @@ def _drawn(
 
 
 def _link(path: Path | None, link_base: Path) -> str | None:
-    """A relative link to a file, as text of an URL: a name may hold what means something there."""
+    """A relative link to a file, percent-encoded, since a name may contain characters with a meaning in URLs."""
     return urllib.parse.quote(os.fsencode(os.path.relpath(path, link_base))) if path else None
 
 
@@ -437,7 +437,7 @@ def _log_lines(log: LogReader) -> list[tuple[float, str, str, int]]:
 
 
 def _foreign(log: LogReader, topic: str) -> Iterator[tuple[str, float, Any]]:
-    """Messages in Foxglove's schemas, whose fields no checker knows."""
+    """Messages in Foxglove's schemas, typed Any: the type checker does not know their fields."""
     return log.messages([topic])
 
 

@@ -139,10 +139,10 @@ class Traces:
         self.missing: dict[str, str] = {}
 
     def attempt(self, name: str, make: Callable[[], T], default: D) -> T | D:
-        """What `make` gives, or `default` and a line in `missing`.
+        """The result of `make`; `default` and a line in `missing` if it raises an exception.
 
-        A log can hold messages of the right schema and no sense (a damaged file, another program): vectors of any
-        length, NaN, texts where numbers are meant. One such topic must not cost the rest of the page.
+        A damaged file, or another program's, can hold messages of the right schema with senseless values: vectors of
+        any length, NaN, text in place of numbers. One such topic must not cost the rest of the page.
         """
         try:
             with np.errstate(all="ignore"):  # a warning of numpy's would be a line of its own on the terminal
@@ -275,7 +275,7 @@ class Traces:
     def camera_angle(self) -> tuple[np.ndarray, np.ndarray] | None:
         """How far the valve has turned since it was measured, by the head cameras: times of capture, angles.
 
-        A rectangle looks the same after half a turn: which of the two it is, the hands' angle says.
+        A rectangle looks the same after half a turn; the hands' angle decides between the two.
         """
         found = self.estimates
         if found is None or len(found.time) == 0:

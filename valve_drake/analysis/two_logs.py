@@ -30,7 +30,7 @@ class TopicPair:
 
 
 def pair_modes(a: Sequence[ModeSpan], b: Sequence[ModeSpan]) -> Pairs:
-    """Stays in the same mode beside each other, in order; None where one run has none."""
+    """Pairs the stays of both runs in the same mode, in order; None where one run has no counterpart."""
     out: Pairs = []
     matcher = difflib.SequenceMatcher(None, [s.mode for s in a], [s.mode for s in b], autojunk=False)
     for what, i, j, k, m in matcher.get_opcodes():
@@ -87,7 +87,7 @@ def settings(a: dict[str, Any], b: dict[str, Any], path: str = "") -> list[tuple
 def compare_messages(a: LogReader, b: LogReader) -> list[TopicPair]:
     """All topics of both logs, in the order of the first log: message by message, the time included, to the bit.
 
-    Messages are held against each other by their numbers, in logs of other programs by their order; what a damaged or
+    Messages are paired by their sequence numbers, in logs of other programs by their order; what a damaged or
     unfinished log lacks is left out.
     """
     logs = (a, b)

@@ -23,7 +23,7 @@ _THOROUGH = (cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_C
 _SEARCHED = (1300, 2000)
 _TILE = 1300  # side of the overlapping parts in which a larger image is searched last [px]
 _OVERLAP = 400
-_MIN_PAIRS = 3  # by the names, if others have no partner: fewer are chance
+_MIN_PAIRS = 3  # pairs by names, if other images have no partner; fewer names may agree by chance
 _WINDOW = 24  # largest half window of the sub-pixel search [px]
 
 
@@ -219,7 +219,7 @@ def _found(gray: np.ndarray, board: Board, quick: bool, thorough: Sequence[int])
 
 
 def _refined(coarse: np.ndarray, gray: np.ndarray) -> np.ndarray | None:
-    """The grid at the saddle points of brightness; None if these are elsewhere."""
+    """The corners at the nearest saddle points of brightness; None if one moves by more than half a pitch."""
     pitch = min(np.linalg.norm(np.diff(coarse, axis=axis), axis=2).min() for axis in (0, 1))
     # A large window averages noise and must hold the whole blurred edge; one that reaches the next corner, or much of
     # the lens's curvature, moves the corner. In a larger image a line is less curved from pixel to pixel.

@@ -1,17 +1,17 @@
 """Calibration of one camera and of the stereo head, from images of a chessboard.
 
-Zhang's method: OpenCV gives the start, one bundle adjustment (Levenberg-Marquardt, analytic Jacobian) ends it for both
-lens models, so that both are judged on the same corners:
+Zhang's method: OpenCV gives the initial values; one bundle adjustment (Levenberg-Marquardt, analytic Jacobian) refines
+both lens models on the same corners, so that they can be compared:
 
     opencv  K and of the distortion k1, k2, p1, p2, k3 those terms that the corners determine, the others 0
     paper   eq. (1), (2): k_x, k_y, u_0, v_0, k_u, k_v
 
-A term is fitted if it lowers the residuals by more than chance would (Bayes's criterion), and only if the lens then
-maps the whole image one to one. What a lens may be where no board was is part of the answer: `sigma_map`, the standard
-deviation of a pixel over the image with the terms left out counted as unknown.
+A term is fitted if it lowers the residuals by more than chance would (Schwarz's Bayesian criterion), and only if the
+lens then maps the whole image one to one. A lens also carries `sigma_px`, its standard deviation over the image: terms
+that were not fitted count as unknown there, so that it is large where no board was.
 
-The root mean square of the residuals does not tell whether a calibration is good. What does: the standard deviations,
-and `split_half`, the difference of points triangulated by two calibrations from every second view.
+The root mean square of the residuals does not tell whether a calibration is good. The standard deviations do, and so
+does `split_half`: the difference between points that two calibrations, each from every second view, triangulate.
 
 Frames: L, R cameras; C one camera; T board. Lengths in m, pixels as in lens.py.
 """
@@ -33,22 +33,24 @@ from valve_drake.checks import ConfigError
 KINDS = ("opencv", "paper")
 RANGES = (0.5, 1.0, 2.0)  # at which points are triangulated [m]
 MIN_VIEWS = 3
-_MAX_FOCAL_SIGMA = 0.02  # relative standard deviation of a focal length above which the calibration is refused
-_MIN_TILT = 8.0  # the steepest board, and two boards against each other, must be tilted by this much [deg]
+_MAX_FOCAL_SIGMA = 0.02  # relative standard deviation of a focal length that is accepted; raise it for coarse work
+_MIN_TILT = 8.0  # some board must be tilted by this against the camera's axis, and by this against another [deg]
 _TILT = "tilt it by up to 45 deg to all sides, or give --distances"
-_OUTLIER = 2.5  # a view with more than this times the median view's rms is named
-_APART = 0.15  # a pair whose X_LR differs more (turn [rad] + shift / distance of the boards) is named as a misfit
+_OUTLIER = 2.5  # a view with more than this times the median view's rms is reported; raise it if good views are
+_APART = 0.15  # a pair whose X_LR differs by more is reported: rotation [rad] + shift / distance of the boards
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 # Sets of distortion terms, as indices of _COEFFICIENTS: k3 never without k2, nor k2 without k1. The first is the start.
 _TERMS = ((0, 1, 2, 3, 4), (0, 1, 2, 3), (0, 2, 3), (2, 3), (0, 1, 4), (0, 1), (0,), ())
 _FRONTAL_TERMS = ((0,), ())
 _POWER = (2, 4, 1, 1, 6)  # the power of the radius with which each term acts
-_PRIOR = (0.2, 0.1, 2e-3, 2e-3, 0.05)  # what each may change at the image's corner, relative to the radius
+# Standard deviation of what an unfitted term may do at the image's corner, relative to the radius there; raise the
+# first for wide-angle lenses, which distort more.
+_PRIOR = (0.2, 0.1, 2e-3, 2e-3, 0.05)
 _MAP = (7, 9)  # rows and columns of the map of standard deviations
-_POOR = 0.2  # rms of a camera's corners beyond which a fisheye's model is tried [px]
+_POOR = 0.2  # a fisheye model is tried if a camera's corners have a larger rms than this [px]
 _FISHEYE = 0.6  # the images are a fisheye's if its model leaves less than this share of the pinhole's rms
-_WORSE = 1.2  # factor by which the rms may rise when terms are dropped to keep the lens from folding back
-_MISFIT = 10.0  # pairs are refused if both cameras together leave more than 1 px + this times each one's own rms
+_WORSE = 1.2  # factor by which the rms may rise when terms are dropped because the lens would fold back
+_MISFIT = 10.0  # pairs are refused if the rms of both cameras together exceeds 1 px + this times that of each alone
 
 
 @dc.dataclass(frozen=True)
@@ -131,7 +133,7 @@ class _Kind(Protocol):
 
 
 class _OpenCvKind:
-    """`free` distortion coefficients of k1, k2, p1, p2, k3; the others stay 0."""
+    """OpenCV's model. Of k1, k2, p1, p2, k3 those with their index in `free` are fitted, the others are 0."""
 
     def __init__(self, free: Sequence[int]):
         self.free = list(free)
@@ -253,7 +255,7 @@ def _solve(views: Sequence[View], kind: _Kind, name: str, start: _State, size: t
     state, (cost, H, _, residuals) = minimize(problem, start, problem.moved)
     corners = sum(len(r) for view in residuals for r in view)
     scale = np.sqrt(np.diag(H)) + 1e-150
-    # A direction that the corners do not see shows as a huge deviation instead of an error.
+    # A direction that the corners do not determine gets a huge standard deviation instead of an error.
     inverse = np.linalg.pinv(H / np.outer(scale, scale), rcond=1e-15, hermitian=True) / np.outer(scale, scale)
     covariance = inverse[: problem.shared, : problem.shared] * cost / max(2 * corners - len(H), 1)
     return Fit(
@@ -273,14 +275,14 @@ def _solve(views: Sequence[View], kind: _Kind, name: str, start: _State, size: t
 
 @dc.dataclass(frozen=True)
 class _Start:
-    """OpenCV's answer for each camera alone, and what follows for both."""
+    """OpenCV's calibration of each camera alone, and the initial X_LR that follows from both."""
 
-    views: tuple[View, ...]  # numbered so that the cameras agree
+    views: tuple[View, ...]  # right corners renumbered so that both cameras agree
     lenses: list[tuple[np.ndarray, np.ndarray]]  # (K, dist) of each camera
     X_LR: np.ndarray | None
     poses: tuple[np.ndarray, ...]  # X_LT of each body
     alone: tuple[float, ...]  # rms of the corners of each camera [px]
-    misfits: list[tuple[str, ...]]  # names of the pairs that put the right camera elsewhere than most do
+    misfits: list[tuple[str, ...]]  # names of the pairs whose X_LR differs from that of most pairs
 
 
 def board_views(
@@ -289,7 +291,7 @@ def board_views(
     corners: Sequence[tuple[np.ndarray | None, ...]],
     distances: Sequence[float] | None = None,
 ) -> list[View]:
-    """Views of those boards that every camera found; with distances [m] all of them are one rigid target."""
+    """Views of the boards that were found in every camera's image; with distances [m] all are one rigid target."""
     views: list[View] = []
     for k, (name, corners_of_each) in enumerate(zip(names, corners)):
         px = tuple(found for found in corners_of_each if found is not None)
@@ -375,7 +377,7 @@ def _determined(full: Fit, views: Sequence[View], sets: Sequence[Sequence[int]],
     sides = ("left.", "right.") if len(full.lenses) == 2 else ("",)
 
     def without(free: Sequence[int]) -> float:
-        """The criterion of a fit with these terms only. They act linearly, so that `full` tells what it leaves."""
+        """The criterion of a fit with these terms only, predicted from `full` to first order without a new fit."""
         out = [side + _COEFFICIENTS[k] for side in sides for k in sets[0] if k not in free]
         at = [names.index(name) for name in out]
         value = np.array([values[name] for name in out])
@@ -410,7 +412,7 @@ def _refuse_fisheye(start: _Start, size: tuple[int, int]) -> None:
         flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
         try:
             other = cv2.fisheye.calibrate(points, px, size, start.lenses[c][0].copy(), np.zeros(4), flags=flags)[0]
-        except cv2.error:  # no start
+        except cv2.error:  # no initial values were found
             continue
         if math.isfinite(other) and other < _FISHEYE * rms:
             raise ConfigError(
@@ -420,11 +422,11 @@ def _refuse_fisheye(start: _Start, size: tuple[int, int]) -> None:
 
 
 def _sigma_maps(opencv: Fit, fit: Fit, views: Sequence[View], size: tuple[int, int]) -> list[np.ndarray]:
-    """Standard deviation of where each lens of `fit` puts what is seen at a pixel, on a grid over the image [px].
+    """`sigma_px` of each lens of `fit`: the standard deviation of its mapping on a grid over the image (_MAP) [px].
 
-    By the corners, with all terms of the distortion: those that `opencv` leaves out may be as large as lenses have
-    them (`_PRIOR`). A turn of the whole camera is no error of its lens: it is taken out where the boards are. The
-    difference between `opencv` and another model counts, too.
+    It is computed from the corners with all distortion terms free; those that `opencv` leaves out have the prior
+    `_PRIOR`. A rotation of the whole camera is no error of its lens: the rotation that fits best at the corners is
+    removed. If `fit` is another model than `opencv`, the difference of the two is added.
     """
     kind = _OpenCvKind(range(5))
     problem = _Problem(views, kind, size)
@@ -475,7 +477,7 @@ def _start(views: Sequence[View], size: tuple[int, int], kind: _OpenCvKind, rigi
     alone, seen = [], []
     for c in range(len(views[0].px)):
         px = [np.vstack([view.px[c] for view in group]).astype(np.float32) for group in groups]
-        # A target with depth needs a first guess of K; the best of a few will do for any lens.
+        # OpenCV needs an initial K for a target that is not flat: three focal lengths are tried, the best fit is kept.
         guesses = [f * size[0] for f in (0.7, 1.4, 2.8)] if rigid else [None]
         best = None
         for guess in guesses:
@@ -516,10 +518,10 @@ def _start(views: Sequence[View], size: tuple[int, int], kind: _OpenCvKind, rigi
 def _one_right_camera(
     X_LT: Sequence[np.ndarray], X_RT: Sequence[np.ndarray], turns: Sequence[int]
 ) -> tuple[np.ndarray, list[int], list[bool]]:
-    """X_LR on which most pairs agree, the quarter turns by which each right board is then numbered, who disagrees.
+    """X_LR on which most pairs agree, the quarter turns by which each right board is renumbered, which pairs disagree.
 
-    A board that looks the same after a turn may have been numbered from another corner in the right image. Each
-    pair and each of its numberings says where the right camera is: the answer is the one nearest to all pairs.
+    A board that looks the same after a turn may be numbered from another corner in the right image. Every numbering
+    of every pair gives a candidate for X_LR; the candidate nearest to all pairs is chosen.
     """
 
     def distance(A: np.ndarray, B: np.ndarray, scale: float) -> float:
@@ -585,12 +587,12 @@ def tilts(fit: Fit) -> list[float]:
 
 
 def _information(fit: Fit) -> float:
-    """Bayes's criterion (Schwarz): smaller explains the corners better for the number of parameters."""
+    """Schwarz's Bayesian criterion: smaller is better, for the residuals and the number of parameters together."""
     return _criterion(fit, 0.0, len(fit.names))
 
 
 def _criterion(fit: Fit, more: float, parameters: int) -> float:
-    """Bayes's criterion of residuals that are larger than those of `fit`, by `more` times a corner's variance."""
+    """Schwarz's criterion if the sum of squares were larger than that of `fit`, by `more` times a corner's variance."""
     n = 2 * sum(len(r) for view in fit.residuals for r in view)
     return n * math.log(max(fit.rms, 1e-9) ** 2 * (1 + more / n)) + math.log(n) * parameters
 
@@ -627,7 +629,7 @@ def _sights(fit: Fit, distance: float) -> tuple[np.ndarray, np.ndarray]:
         xy = Q[:, :2] / Q[:, 2:]
         px.append(lens.project(xy))
         seen &= (Q[:, 2] > 0) & ((px[-1] >= 0) & (px[-1] <= [lens.width - 1, lens.height - 1])).all(1)
-        # Beyond its corners a lens model may fold back into the image.
+        # Outside the image a lens model may fold back: such points project into the image but are not seen there.
         seen &= np.linalg.norm(lens.normalize(px[-1]) - xy, axis=1) < 1e-3
     return px[0][seen], px[1][seen]
 

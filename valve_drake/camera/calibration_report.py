@@ -24,7 +24,7 @@ from valve_drake.console import console
 
 @dc.dataclass(frozen=True)
 class Report:
-    """What a calibration has to say: numbers for programs, a page for people, the most important for a terminal."""
+    """The result of a calibration: numbers for JSON, an HTML page, and the main lines for a terminal."""
 
     numbers: dict[str, Any]
     page: str
@@ -116,7 +116,7 @@ def _corners(
 
 
 def _some(paths: Sequence[Path]) -> str:
-    """Names for a line: all of a few."""
+    """The first six names, and how many more there are."""
     names = [path.name for path in paths[:6]]
     return ", ".join(names) + (f" and {len(paths) - 6} more" if len(paths) > 6 else "")
 
@@ -247,7 +247,7 @@ def _comment(result: cal.Calibration) -> str:
 
 
 def finite(value: Any) -> Any:
-    """JSON has no NaN: what is not known becomes null."""
+    """The tree with None for every float that is not finite: JSON has no NaN."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list):

@@ -31,7 +31,7 @@ _NUMBERS_AND_SIZE = {
     "height": ("image_height", "height", "image_Height"),
     "model": ("distortion_model", "camera_model"),
 }
-# What these files say besides, and what does not change where a point is seen.
+# Keys that are accepted and ignored: they do not change where a point is projected.
 _HARMLESS = {
     *("header", "camera_name", "frame_id", "calibration_time", "calibration_date", "nframes", "nr_of_frames", "flags"),
     *("board_width", "board_height", "square_size", "marker_size", "aspectRatio", "fix_aspect_ratio"),
@@ -227,7 +227,7 @@ def from_ini(text: str, key: str) -> LensModel:
 
 
 def opencv_matrix(tree: Any) -> Any:
-    """Of YAML's tag !!opencv-matrix."""
+    """The mapping below YAML's tag !!opencv-matrix. Raises ValueError if it has no data."""
     if not isinstance(tree, dict) or "data" not in tree:
         raise ValueError("it must have rows, cols, dt and data")
     return tree
@@ -265,7 +265,7 @@ def _refuse_model(model: Any, key: str) -> NoReturn:
 
 
 def _refuse_parts(data: dict[str, Any], key: str) -> None:
-    """An image that is a part of the sensor's, or made of fewer pixels, has other numbers."""
+    """Raises ConfigError for a region of interest or binning: the camera matrix is that of the whole sensor."""
     for name in ("binning_x", "binning_y"):
         require(data.get(name, 0) in (0, 1), f"{key}: {name}", "0 or 1", data.get(name))
     roi = data.get("roi") or {}
@@ -320,7 +320,7 @@ def _numbers(value: Any, key: str) -> np.ndarray:
 
 
 def _number(text: Any) -> Any:
-    """A number of its text, as XML and ini files have it; everything else as it is."""
+    """The number that a text of an XML or ini file stands for; anything that is no such text is returned as it is."""
     if not isinstance(text, str) or len(text) > 64:
         return text
     for kind in (int, float):

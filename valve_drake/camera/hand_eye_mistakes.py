@@ -49,7 +49,7 @@ def refuse_mistakes(seen: Seen, poses: Poses) -> None:
     if size[0] > _FINE_DEG or size[1] > _FINE_MM:
         mistake = _better(seen, poses, size) or _exchanged(seen, poses)
         if mistake:
-            raise ConfigError(f"{_told(size)}, but fit {mistake}")
+            raise ConfigError(f"{_misfit_text(size)}, but fit {mistake}")
 
 
 def refuse_scatter(result: HandEye, seen: Seen, poses: Poses) -> None:
@@ -57,12 +57,13 @@ def refuse_scatter(result: HandEye, seen: Seen, poses: Poses) -> None:
     if result.arm_deg > MAX_SCATTER_DEG or result.arm_mm > MAX_SCATTER_MM:
         worst = [poses.names[poses.used[k]] for k in np.argsort(-result.rotation_deg, kind="stable")[:3]]
         raise ConfigError(
-            f"{_told(disagreement(seen))}, more than any arm scatters, and no usual mistake explains it: does each "
-            f"pose belong to its image, are board and pitch right? The most off: {', '.join(worst)}"
+            f"{_misfit_text(disagreement(seen))}, more than any arm scatters, and no usual mistake explains it: does "
+            f"each pose belong to its image, are board and pitch right? The most off: {', '.join(worst)}"
         )
 
 
-def _told(size: np.ndarray) -> str:
+def _misfit_text(size: np.ndarray) -> str:
+    """The beginning of a refusal; size: of `disagreement` [deg, mm]."""
     return f"hand-eye: the poses do not fit the images (they disagree by {size[0]:.1f} deg, {size[1]:.0f} mm rms)"
 
 

@@ -1,7 +1,7 @@
 """Photographs from files, of any origin: bounded before they are decoded, refused in one line if they are damaged.
 
 A decoder allocates what a header claims, and libjpeg goes on where the data are damaged: blocks are then shifted and
-the pose is wrong. So the header is read here first, and what the decoder complains about decides.
+the pose is wrong. So the header is read here first, and the decoder's warnings decide whether a file is damaged.
 """
 
 import contextlib
@@ -46,7 +46,7 @@ def decode(data: bytes, key: str, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
         raise ConfigError(f"{key}: a JPEG of more than {_MAX_SCANS} scans")
     with _decoder_messages() as messages:
         try:
-            # A turn noted in the file is not applied: a calibration is about the pixels as the sensor has them.
+            # The EXIF orientation is not applied: a calibration refers to the sensor's own pixels.
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
         except (cv2.error, MemoryError):
             image = None

@@ -21,7 +21,7 @@ from valve_drake.checks import ConfigError, require, require_in, shown
 
 SigmaMap: TypeAlias = Sequence[Sequence[float]] | None  # rows from top to bottom, evenly over the image [px]
 
-KNOWN = 1.0  # standard deviation up to which a lens counts as known at a pixel [px]
+KNOWN = 1.0  # a lens counts as known at a pixel up to this standard deviation; raise it for coarse work [px]
 _MOST_PX = 1e6  # of a focal length, and of the principal point's distance from the image
 _NEWTON_STEPS = 6  # quadratic: 1e-12 px after four steps for any lens that `check` lets pass
 
@@ -120,7 +120,7 @@ class Lens:
             slope = 1 + 2 * (self.k_u * of_u / by_u + self.k_v * of_v / by_v)
             step = (of_u + of_v - rr) / slope
             rr = rr + step
-            if np.abs(step).max(initial=0.0) < 1e-3:  # the next one would be its square times k, some 1e-12
+            if np.abs(step).max(initial=0.0) < 1e-3:  # convergence is quadratic: the next step would be some 1e-12
                 break
         out = np.empty(np.shape(xy))
         out[..., 0], out[..., 1] = u / (1 + self.k_u * rr) + self.u_0, v / (1 + self.k_v * rr) + self.v_0
@@ -177,9 +177,9 @@ class OpenCvLens:
             )
 
     def radial_reach(self) -> tuple[float, float]:
-        """How far from the centre the image's radius still grows with the angle of a ray, and the farthest corner [px].
+        """(radius up to which the projection is one to one, radius of the image's farthest corner) [px].
 
-        Beyond it no ray, or another one, belongs to a pixel.
+        About the principal point. Beyond the first radius a pixel belongs to no ray, or to two.
         """
         k1, k2, _, _, k3, k4, k5, k6 = np.append(self.dist, np.zeros(8))[:8] if len(self.dist) else np.zeros(8)
         r = np.tan(np.linspace(0, math.radians(89.9), 4000))
@@ -204,7 +204,8 @@ class OpenCvLens:
         if len(xy) == 0:
             return np.zeros((*np.shape(px), 2))
         points = np.column_stack([xy, np.ones(len(xy))])
-        J = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.K, self.dist)[1][:, 3:5]  # by t_x, t_y at z = 1
+        # At z = 1 the derivatives by t_x, t_y are those by x, y.
+        J = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.K, self.dist)[1][:, 3:5]
         return np.linalg.inv(J.reshape(-1, 2, 2)).reshape(*np.shape(px), 2)
 
     def project(self, xy: np.ndarray) -> np.ndarray:
@@ -244,7 +245,7 @@ class StereoHead:
     left: LensModel
     right: LensModel
     X_LR: np.ndarray
-    rms_px: float = 0.0  # residual of the calibration's own corners, 0 where unknown: what pixels are worth in 3D
+    rms_px: float = 0.0  # rms residual of the calibration's own corners [px]; 0: unknown
 
     def __post_init__(self) -> None:
         X = np.array(self.X_LR, float)
@@ -262,7 +263,7 @@ def load_head(path: str | pathlib.Path) -> StereoHead:
     """Reads a head calibration (see `save_head`). Raises ConfigError naming the file and the key."""
     key = f"calibration {path}"
     data = yaml_file.read(path, source=key)
-    if not isinstance(data, dict):  # whatever the file is, it is not shown
+    if not isinstance(data, dict):  # its content is not shown: it may be any file of the user's
         raise ConfigError(f"{key} must be a mapping with left, right and X_LR")
     return head_from(data, key)
 
@@ -359,7 +360,7 @@ def _check_sigma(grid: SigmaMap, key: str) -> None:
 
 
 def _sigma_at(grid: SigmaMap, width: int, height: int, px: np.ndarray) -> np.ndarray:
-    """Bilinear between the grid's points, which lie evenly over the image from corner to corner."""
+    """Standard deviation (...,) at px (..., 2) [px], bilinear between points that lie evenly over the image."""
     px = np.asarray(px, float)
     if grid is None:
         return np.zeros(px.shape[:-1])

@@ -1,8 +1,8 @@
-"""MCAP files, written with the work split in two: what the loop does, and what a thread can do beside it.
+"""Writes MCAP files in two steps: the control loop fills a Chunk, a thread compresses and writes it.
 
-The loop fills a Chunk, at about a microsecond a message. McapFile compresses and writes whole chunks, nearly all
-of it outside Python's lock. mcap.writer.Writer holds the lock for 4 to 7 microseconds a message wherever it runs, so
-that a thread that uses it slows the loop down. The records are the mcap package's, and so is every byte of the file.
+Filling takes about a microsecond a message. McapFile compresses and writes whole chunks nearly without holding Python's
+interpreter lock. mcap.writer.Writer holds that lock for 4 to 7 microseconds a message, so that it would slow the loop
+down from any thread. Records are serialised by the mcap package.
 """
 
 import collections
@@ -19,7 +19,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-CHUNK_SIZE = 1 << 20  # a chunk is closed when it is larger [bytes]
+CHUNK_SIZE = 1 << 20  # a chunk is closed when it is larger; raise it for denser compression [bytes]
 LIBRARY = "valve_drake"
 RECOVERED = "recovered"  # metadata of a recovered log
 
@@ -46,7 +46,7 @@ def definition(record: records.Schema | records.Channel) -> Definition:
 
 
 class Chunk:
-    """Records that will be compressed together. It defines its own channels, so that it can be read alone."""
+    """Records that are compressed together. It holds the definitions of its channels, so that it can be read alone."""
 
     def __init__(self) -> None:
         self.definitions: dict[tuple[type, int], Definition] = {}
@@ -63,7 +63,7 @@ class Chunk:
                 self.size += len(one.data)
 
     def add(self, channel: int, when: int, sequence: int, data: bytes, published: int | None = None) -> None:
-        """Adds a message; `when` it is logged, and `published` if that is another time [ns]."""
+        """Adds a message logged at `when`; `published`: its publish time, if another [ns]."""
         self.index[channel] += (when, self.size)
         length = len(data)
         at = when if published is None else published
@@ -132,7 +132,7 @@ class McapFile:
         )
 
     def sync(self) -> None:
-        """Has everything on the disk, safe against a crash of the machine."""
+        """Forces everything to the disk (fsync), where it survives a crash of the machine."""
         self._file.flush()
         os.fsync(self._file.fileno())
 
@@ -195,5 +195,5 @@ def _bytes_of(record: records.McapRecord) -> bytes:
 
 
 def active(path: Path) -> Path:
-    """Where a log stands until it is complete."""
+    """The name of a log until it is complete: FILE.active."""
     return path.with_name(path.name + ".active")

@@ -1,7 +1,7 @@
 """What an MCAP file holds, found in one pass from end to end: where each sound message is, and what is not sound.
 
-Every record proves its own end, so a damaged one costs only itself: reading goes on at the next that is sound.
-The summary is not needed: it is held against what was read. Definitions of topics are taken from wherever they stand:
+The end of every record can be checked, so a damaged one costs only itself: reading goes on at the next sound record.
+The summary is not needed; it is compared with what was read. Definitions of topics are taken from wherever they stand:
 the data, the summary, or a chunk that is damaged (and `damage` says so). Messages without a definition are kept under
 topics /unknown/channel_N.
 """
@@ -41,7 +41,7 @@ from valve_drake.recording.schemas import known
 
 INDEX_LIMIT = 192 << 20  # kept in memory; raise it if logs of hours are read too slowly [bytes]
 DEFINITIONS_LIMIT = 64 << 20  # schemas and channels, in all [bytes]
-LARGEST = 1 << 32  # that a record may be; a truncated one that claims more is damaged [bytes]
+LARGEST = 1 << 32  # size of a record, at most; a truncated one that claims more is damaged [bytes]
 
 _ALWAYS = frozenset((Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END))
 _LOSSLESS = frozenset((Opcode.MESSAGE_INDEX, Opcode.STATISTICS, Opcode.DATA_END, Opcode.FOOTER, Opcode.CHUNK_INDEX))
@@ -49,7 +49,7 @@ _KNOWN = frozenset(int(opcode) for opcode in Opcode)
 _PARSED = frozenset((Opcode.HEADER, Opcode.METADATA, Opcode.STATISTICS, Opcode.DATA_END, Opcode.FOOTER))
 _BEGINNING = re.compile(rb"(?s)(?=[\x06\x09\x0c\x0f].{4}\x00{4})")  # perhaps a chunk, attachment, metadata, end of data
 _ANYTHING = re.compile(rb"(?s)(?=[\x03-\x0f].{4}\x00{4})")  # perhaps a record
-_CHAIN = 3  # records one after the other that prove where a record without a CRC begins
+_CHAIN = 3  # consecutive sound records that confirm the beginning of a record without a CRC
 _INDEX = struct.Struct("<HI")  # channel, size of the index
 _DAMAGE = (ValueError, struct.error)  # what parsing damaged bytes raises
 
@@ -76,7 +76,7 @@ class _Gap:
     size: int
     opcode: int | None  # of the record, where its end is known
     reason: str
-    closed: bool  # the end of the data has been read before it
+    closed: bool  # a DataEnd record was read before it
 
 
 class Contents:
@@ -211,7 +211,7 @@ class Contents:
         elif opcode in _KNOWN:
             self._take_other(record, position, limit)
         elif self.library == LIBRARY or not self._follows(record.end, limit, 1):
-            raise Unsound  # a private record is skipped, but this program writes none
+            raise Unsound  # other programs' private records are skipped; this program writes none, so it is damage
         return record.end
 
     def _check_end(self, record: Frame, used: int, limit: int) -> None:

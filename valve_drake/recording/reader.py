@@ -1,7 +1,7 @@
 """The log's reader: MCAP files of every program; whole, unfinished, cut off and damaged ones through one path.
 
-Opening a log reads it once from end to end and checks every CRC (contents.py). It never gives up: what cannot be read
-is named in `damage`, one line each, and everything else is there.
+Opening a log reads it once from end to end and checks every CRC (contents.py). It does not stop at damage: what cannot
+be read is listed in `damage`, one line each, and everything else can be read.
 """
 
 import dataclasses as dc
@@ -25,14 +25,14 @@ from valve_drake.recording.contents import Contents
 from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.records import HEAD, ROW, Frame, attachment, attachment_to
 
-LONGEST = 200  # of a reason in an error line [characters]
+LONGEST = 200  # a reason in an error line is cut to this [characters]
 
 _OTHERS = {b"#ROSBAG": "a ROS 1 bag", b"SQLite format 3": "a ROS 2 bag", b"RRF": "a Rerun recording"}
 _DATA = ROW.itemsize  # of a message, from the beginning of its record [bytes]
 
 
 class Record(NamedTuple):
-    """One message as it stands in the file."""
+    """One message, not decoded."""
 
     topic: str
     when: int  # logged [ns]

@@ -67,7 +67,7 @@ class RecorderSystem(LeafSystem):
 
     Publishes every TICK from 0, in the order of the rows. A publish at t sees the values before the updates at t: what
     the sensors show at t is written at t, what a block makes of it during the tick is written at t + TICK.
-    The sink, and what was written last, stand outside the Context: a recorder serves one simulation.
+    The sink, and what was written last, are not part of the Context: a recorder serves one simulation.
     """
 
     def __init__(self, sink: Sink, signals: Iterable[Signal], name: str = "recorder"):
@@ -104,7 +104,7 @@ class RecorderSystem(LeafSystem):
                 port.read(context)
             for row in rows:
                 if row.watched and row.watched.value is row.seen:
-                    continue  # true of most rows at most ticks, so it is tested here, without a call
+                    continue  # the usual case: tested here, since a call for each row would cost more
                 if (values := row.news()) is not None:
                     self._write(row.signal, time, values)
 
@@ -117,7 +117,7 @@ class RecorderSystem(LeafSystem):
     def _write(self, signal: Signal, time: float, values: list[Any]) -> None:
         message = signal.encode(time, *values)
         if message is not None:
-            self._sink.write(signal.topic, serialized(message), time)  # once, however many sinks there are
+            self._sink.write(signal.topic, serialized(message), time)  # serialised once for all sinks
             if signal.urgent:
                 self._sink.flush()
 

@@ -1,9 +1,9 @@
-"""MCAP records as they stand in a file: parsed with bounds, and as tolerant as the specification asks.
+"""Parses MCAP records with bounds on every length, and as tolerantly as the specification asks.
 
 Bytes behind the fields of a record are ignored (later versions of the format may add fields), and a CRC of 0 is no
-CRC. Every length is held against the end of its record before anything is copied, and a compressed chunk against
-MAX_CHUNK before it is unpacked: a file of a few kB cannot take gigabytes. All functions raise Unsound for bytes that
-are no such record.
+CRC. Every length is compared with the end of its record before anything is copied, and the size of a compressed chunk
+with MAX_CHUNK before it is unpacked: a file of a few kB cannot take gigabytes. All functions raise Unsound for bytes
+that are no such record.
 """
 
 import array
@@ -97,7 +97,7 @@ def _parse(opcode: int, f: "_Fields") -> McapRecord:
             return Metadata(name=f.text(), metadata=f.texts())
         case Opcode.STATISTICS:
             counts = {name: f.number(size) for name, size in _STATISTICS.items()}
-            f.skip(f.number(4))  # messages by channel: the messages say it themselves
+            f.skip(f.number(4))  # counts by channel: the messages themselves are counted
             return Statistics(channel_message_counts={}, **counts)
         case Opcode.DATA_END:
             return DataEnd(data_section_crc=f.number(4))
@@ -129,7 +129,7 @@ def attachment_to(data: Buffer, record: Frame, load: bool = True) -> tuple[Attac
 def chunk_at(data: Buffer, record: Frame) -> ChunkAt:
     """A chunk's head."""
     f = _Fields(data, record.start, record.end)
-    f.skip(16)  # its messages' first and last time: the messages say it themselves
+    f.skip(16)  # times of its first and last message: they are taken from the messages
     size, stored, compression = f.number(8), f.number(4), f.text()
     start, end = f.skip(f.number(8))
     if compression not in ("", "lz4", "zstd"):
@@ -171,7 +171,7 @@ def _unpack(packed: bytes, chunk: ChunkAt) -> bytes:
 
 
 def salvaged(data: Buffer, chunk: ChunkAt) -> bytes:
-    """What can still be unpacked of a chunk that is damaged: nothing proves it."""
+    """What can still be unpacked of a damaged chunk: it may be wrong, since no CRC confirms it."""
     if not chunk.compression:
         return data[chunk.start : min(chunk.end, chunk.start + MAX_CHUNK)]
     zstd = chunk.compression == "zstd"
@@ -198,7 +198,7 @@ class Scan(NamedTuple):
 
 
 def scan(data: Buffer, position: int, end: int, only_messages: bool = False) -> Scan:
-    """Goes over records up to `end`, to the first that is none, or with `only_messages` the first of another kind."""
+    """Scans records up to `end` or the first unsound one; with `only_messages`, up to the first of another kind."""
     found = array.array("Q")
     definitions: list[Frame] = []
     size, unpack, message = HEAD.size, HEAD.unpack_from, int(Opcode.MESSAGE)

@@ -1,7 +1,7 @@
 """Serialises messages that differ in numbers only by writing the numbers into the bytes of a template.
 
-Protobuf writes a double as its 8 bytes. A message in which nothing changes but doubles and the time is thus the same
-string of bytes with others in known places; to fill them in costs a tenth of building and serialising it anew.
+Protobuf writes a double as its 8 bytes. If only doubles and the time change from one message to the next, only bytes at
+known places change; filling those in takes a tenth of the time of building and serialising the message.
 """
 
 import operator
@@ -13,18 +13,19 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from valve_drake.recording.schemas import Encoded
 
-STAMP = Timestamp(seconds=2**31, nanos=999_999_999)  # placeholder for the time in a form; the longest encoding there is
+# Placeholder for the time in a template; its encoding is the longest possible.
+STAMP = Timestamp(seconds=2**31, nanos=999_999_999)
 _STAMP = STAMP.SerializeToString()
-_SLOTS = 0x7A5A_C3A5_3C96_0000  # the bits of slot 0, which nothing else in a form has
+_SLOTS = 0x7A5A_C3A5_3C96_0000  # the bits of slot 0; no other value in a template has them
 
 
 def slot(k: int) -> float:
-    """What stands for the k-th number in a form."""
+    """The placeholder of the k-th number in a template."""
     return struct.unpack("<d", struct.pack("<Q", _SLOTS + k))[0]
 
 
 class Refilled:
-    """A form: a message with slot(0) ... slot(count - 1) for its numbers, and STAMP for the time."""
+    """A template: a message with slot(0) ... slot(count - 1) for its numbers, and STAMP for the time."""
 
     def __init__(self, form: Proto, count: int):
         self._kind = type(form)

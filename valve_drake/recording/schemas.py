@@ -66,7 +66,7 @@ class Vector(Message):
 
 
 class Encoded(NamedTuple):
-    """A message that its maker has serialised."""
+    """A message that is already serialised."""
 
     kind: type[Proto]
     data: bytes
@@ -102,8 +102,8 @@ def proto_class(kind: type[Message]) -> type[Proto]:
 def encode(message: Message) -> bytes:
     """The message as the bytes that go into the log: what its protobuf class would serialise.
 
-    Written straight from the arrays: two to four times as fast as by way of the class, and it is
-    the larger part of what logging costs the loop.
+    Written directly from the arrays, which is two to four times as fast as using the protobuf class; encoding takes
+    most of the time that logging costs the control loop.
     """
     codec = _codec(type(message))
     return b"".join([write(value) for write, value in zip(codec.writers, codec.values(message))])
@@ -117,7 +117,7 @@ def serialized(message: Loggable) -> Encoded:
 
 
 def parsed(message: Encoded) -> Message | Proto:
-    """What was serialised: one of the program's messages, or foxglove's."""
+    """The decoded message: one of the program's, or foxglove's."""
     kind = kind_named(message.kind.DESCRIPTOR.full_name)
     return message.kind.FromString(message.data) if kind is None else decode(kind, message.data)
 
@@ -224,7 +224,7 @@ def _field_codec(kind: type[Message], field: dc.Field[Any], hint: Any) -> _Field
 def _array_codec(kind: type[Message], field: dc.Field[Any]) -> _FieldCodec:
     shape, optional = field.metadata["shape"], field.metadata["optional"]
     if shape.count(-1) > (0 if optional else 1):
-        # Its length could not be told from the number of values, or no rows from None.
+        # The shape could not be recovered from the number of values, or an empty array not distinguished from None.
         raise TypeError(f"{kind.__name__}.{field.name}: no protobuf for an array {shape}, optional={optional}")
 
     def put(value: np.ndarray | None) -> bytes:
@@ -247,7 +247,7 @@ def _varint(n: int) -> bytes:
 
 
 def _writer(number: int, field: _FieldCodec) -> Callable[[Any], bytes]:
-    """A field's value as tag and bytes; nothing for zeros and empty ones, as proto3 has it."""
+    """The encoder of a field: tag and bytes; nothing for zero and empty values, which proto3 leaves out."""
     put = field.put
     sized = field.repeated or field.proto_type in (_Field.TYPE_STRING, _Field.TYPE_BYTES, _Field.TYPE_MESSAGE)
     wire_type = 2 if sized else 1 if field.proto_type == _Field.TYPE_DOUBLE else 0

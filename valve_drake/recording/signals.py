@@ -130,7 +130,7 @@ def signals(
     """All rows of the program's log.
 
     frames: (robot state, estimate, plan, turn) -> (parent, child, X (3, 4)) of every frame to show.
-    scene: what moves with these frames.
+    scene: the shapes that are drawn in these frames.
     calibrations: camera -> its (width, height) and pinhole matrix (3, 3) [px].
     """
     rows = [output(block, port, kind) for block, port, kind in OUTPUTS]
@@ -233,7 +233,7 @@ def wrist_camera(side: str) -> list[Signal]:
 
 
 def calibration(camera: str, size: tuple[int, int], K: np.ndarray) -> Signal:
-    """A camera's pinhole, again every second so that a viewer finds it wherever it begins."""
+    """A camera's pinhole matrix, repeated every second so that a viewer that joins late gets it."""
     return Signal(f"/{camera}/calibration", {}, lambda time: foxglove.calibration(camera, time, size, K), period=1.0)
 
 
@@ -277,7 +277,7 @@ def health_line() -> Signal:
 
 
 def mode_events(port: str = "supervisor.mode") -> list[Signal]:
-    """Every change of mode, and the verdict, brought to the disk at once."""
+    """Every change of mode, and the verdict, flushed to the disk at once."""
 
     def key(state: ModeState) -> tuple[Any, ...]:
         return state.mode, state.activation, state.verdict

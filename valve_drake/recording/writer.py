@@ -1,8 +1,8 @@
-"""The log's writer: MCAP with protobuf, safe against crashes, and never in the way of the loop.
+"""The log's writer: MCAP with protobuf messages; a crash loses at most FLUSH_PERIOD, and the control loop never waits.
 
-`write` adds a serialised message to a chunk in memory. A thread compresses whole chunks and brings them to
-the disk, so that no tick waits for it. The file's bytes depend on the messages alone: chunks are closed by size, by the
-messages' own time and by `flush`, never by the clock on the wall, and nothing of the machine or the day is written.
+`write` adds a serialised message to a chunk in memory. A thread compresses whole chunks and writes them to the disk.
+The file's bytes depend on the messages alone: chunks are closed by size, by the messages' own time and by `flush`,
+never by the wall clock, and neither machine nor date is written.
 
 While it is being written the log is FILE.active (active.py); it is renamed to FILE when it is complete. Whatever kills
 the program, all but the last FLUSH_PERIOD of the log's own time can be read back (reader.py). Every chunk defines the
@@ -54,11 +54,11 @@ class LogWriter:
         self._chunk = Chunk()
         self._schemas: dict[str, Definition] = {}  # by full name
         self._channels: dict[str, _Channel] = {}
-        self._interval = 0  # of FLUSH_PERIOD, that the last message belongs to
+        self._interval = 0  # number of the FLUSH_PERIOD that the last message belongs to
         self._handed, self._written = 0, 0  # bytes, to the thread and by it
         self._error = ""
         self.spent = 0.0  # processor time of the thread [s]
-        self._told = self._closed = False
+        self._error_logged = self._closed = False
         self._jobs: queue.SimpleQueue[tuple[int, Callable[..., object], tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="log writer", daemon=True)
         self._thread.start()
@@ -113,7 +113,7 @@ class LogWriter:
         self.flush()
 
     def flush(self) -> None:
-        """Has everything so far brought to the disk, without waiting for it."""
+        """Hands everything so far to the thread, to be written to the disk; does not wait for it."""
         self._close_chunk()
         self._hand_over(0, self._mcap.sync)
 
@@ -128,7 +128,7 @@ class LogWriter:
             raise LogError(self._error)
 
     def _end(self, last: Callable[[], None]) -> None:
-        """Has the thread do `last` as its last job, and waits for it."""
+        """Gives the thread `last` as its last job, and waits until it has ended."""
         self._hand_over(0, last)
         self._jobs.put(None)
         self._thread.join()
@@ -172,8 +172,8 @@ class LogWriter:
         self._jobs.put((size, job, args))
 
     def _tell(self) -> None:
-        if not self._told:
-            self._told = True
+        if not self._error_logged:
+            self._error_logged = True
             logging.getLogger(__name__).error("%s", self._error)
 
     def _stop(self, reason: str) -> None:

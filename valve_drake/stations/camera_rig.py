@@ -1,8 +1,8 @@
 """The simulated cameras: rendered images through a real lens, blur, noise and JPEG.
 
 `CameraRig` owns a scene of its own, made only to be rendered; a camera block keeps the joint positions at capture
-time and delivers the image made from them `latency` later. So an image shows the instant it was taken, whenever it is
-read, and a camera that nobody looks at costs nothing.
+time and delivers the image made from them `latency` later. So an image shows the scene at its capture, whenever it is
+read, and a camera that no block reads costs nothing.
 
 Pixel convention: Drake's renderer puts the centre of the first pixel at (0.5, 0.5), everybody else here at (0, 0).
 It is converted in `_Lensed.__init__` alone.
@@ -40,8 +40,8 @@ from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.simulation_config import CameraConfig, LightConfig, ValveConfig
 
-ROLL = 0.17  # of the render against the image; edges at this angle are known to a row of the render only [rad]
-MAP_BLUR = 0.4  # standard deviation of what the bilinear map blurs [px]
+ROLL = 0.17  # of the render against the image; only edges at this angle lie along the render's rows [rad]
+MAP_BLUR = 0.4  # standard deviation of the blur that the bilinear map adds [px]
 
 
 @dc.dataclass(frozen=True)
@@ -54,12 +54,12 @@ class Mount:
 
 
 class _Lensed:
-    """From an ideal rendered image to the raw image of one lens.
+    """Turns an ideal rendered image into the raw image of one lens.
 
-    The render's camera is turned about the optical axis by ROLL. A renderer asks at points what is there, so that an
-    edge along a row of them is known to the row only; but level and upright edges, that a room is full of, cross many
-    rows of a turned render, and the lens's map, which looks up every pixel in it anyway, turns them back. The map is
-    bilinear: its weights for a point of the render sum to one over the image, so that no edge is moved.
+    The render's camera is rotated about the optical axis by ROLL. A renderer samples points, so an edge along a row of
+    samples is located to that row only. Level and upright edges are common in a room; in a rotated render they cross
+    many rows. The lens's map resamples every pixel anyway and rotates the image back. The map is bilinear: the weights
+    of a rendered point sum to one over the image, so that no edge is moved.
     """
 
     def __init__(self, lens: LensModel):
@@ -145,7 +145,7 @@ class CameraRig:
         self._lensed = {name: _Lensed(mount.lens) for name, mount in mounts.items()}
 
     def pose(self, q: np.ndarray) -> None:
-        """Poses the renderer's own scene as it was at capture time; the running plant is not touched."""
+        """Sets the positions of the renderer's own scene; the running plant is not touched."""
         self.plant.SetPositions(self._plant_context, q)
 
     def _render(self, frame: Frame, X_FC: np.ndarray, info: CameraInfo) -> np.ndarray:
@@ -168,7 +168,7 @@ class CameraRig:
         return cv2.GaussianBlur(image, (0, 0), float(np.sqrt(blur**2 - MAP_BLUR**2))) if blur > MAP_BLUR else image
 
     def captured(self, name: str, capture: "Capture") -> None:
-        """Nothing to do ahead: images are made where they are read."""
+        """Does nothing: this rig makes an image when it is read."""
 
     def frame(self, name: str, capture: "Capture") -> CameraFrame:
         """What the camera delivers: lens, blur, white balance, noise, JPEG and back."""
@@ -188,9 +188,9 @@ class CameraRig:
 
 
 def _noise_pool(seed: int, deviation: float) -> np.ndarray:
-    """White noise in grey levels (int16), several images' worth: every image takes a stretch from a place of its own.
+    """White noise in grey levels (int16), more than one image needs: every image uses a stretch from a random place.
 
-    Drawing a million numbers anew for each image would cost as much as its rendering.
+    A million new random numbers for each image would take as long as its rendering.
     """
     noise = np.random.Generator(np.random.SFC64([seed, 99])).standard_normal(4 << 20, dtype=np.float32)
     return np.rint(deviation * noise).astype(np.int16)
@@ -211,7 +211,7 @@ def encode_frame(camera: str, time: float, sequence: int, image: np.ndarray, qua
 def decode_image(data: bytes) -> np.ndarray:
     """JPEG bytes -> (H, W, 3) RGB. Raises ValueError if they are no whole image."""
     try:
-        # A turn noted in the file is not applied: a calibration is about the pixels as the sensor has them.
+        # The EXIF orientation is not applied: a calibration refers to the sensor's own pixels.
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if b"\xff\xd9" in data else None
     except (cv2.error, MemoryError):
@@ -231,10 +231,10 @@ class Capture:
 
 
 class Images(typing.Protocol):
-    """Who makes the images: `CameraRig` here and now, `CameraWorkers` beside the run."""
+    """Makes the images: `CameraRig` in this process when they are read, `CameraWorkers` in processes of their own."""
 
     def captured(self, name: str, capture: Capture) -> None:
-        """Told of every capture, looked at or not, so that its image can be begun ahead."""
+        """Called at every capture, read or not, so that its image can be begun early."""
 
     def frame(self, name: str, capture: Capture) -> CameraFrame:
         """The image of a capture."""
@@ -242,7 +242,7 @@ class Images(typing.Protocol):
 
 @dc.dataclass(frozen=True)
 class _Film:
-    """The state of a camera: what was delivered last, and what is on its way, oldest first."""
+    """The state of a camera: the capture delivered last, and those not delivered yet, oldest first."""
 
     delivered: Capture = Capture()
     coming: tuple[Capture, ...] = ()

@@ -5,10 +5,10 @@ the ports. `lcm_receiver` reads it in slot 3, just before the next tick; `lcm_se
 at its end. When the station is initialised, it waits for every device's first report.
 
 A report is news only if its stamp is later than that of the last one. Sensors with noise (wrists, cameras), and any
-device that reports a speed, must also say something else than last time. Duplicates, overtaken messages and frozen
+device that reports a speed, must also report other values than last time. Duplicates, overtaken messages and frozen
 sensors are therefore silence, which `health` reports as age by the receiver's clock. A message that cannot be read,
 an image that cannot be decoded and a report that is not finite are dropped and counted; the first two are a fault if
-they go on, the last one at once. A wrist sensor that is broken or silent reads NaN, since its last word is not the
+they go on, the last one at once. A wrist sensor that is broken or silent reads NaN, since its last report is not the
 present force.
 
 Drake's own LCM subscribers are not used: their Python binding keeps one message a channel until it is asked for, and
@@ -65,20 +65,20 @@ from valve_drake.stations.reports import BadMessages, LeastDelay, Lockstep, Stam
 NEVER_STILL = tuple(row.key for row in REPORTS if row.device.endswith("wrist_sensor"))
 SPEEDS = ("base.odometry", *(f"{side}_arm.velocity_measured" for side in SIDES))  # ports that tell of motion
 MOVING = 0.005  # [rad/s, m/s]
-ABSURD = 1e6  # a number of a report beyond this is no measurement, in any unit of the table
-LOOKED_AT = 0.75  # after the last look at a camera it is requested for this long: a search looks twice a second [s]
-EARLY = 0.1  # an image may be stamped so far ahead of the robot's other reports [s]
-DECODING = 5e-3  # that an image takes, with room [s]
-AHEAD = SLOT / 2  # the station is read this long before a tick, when the last one's slot 3 is done [s of the diagram]
+ABSURD = 1e6  # a larger number in a report is no measurement, in any unit of the table
+LOOKED_AT = 0.75  # a camera is requested for this long after it was last read; the search reads it every 0.5 s [s]
+EARLY = 0.1  # an image may be stamped this far ahead of the robot's other reports [s]
+DECODING = 5e-3  # time to allow for decoding an image; raise it for larger images [s]
+AHEAD = SLOT / 2  # the station is read this long before a tick, after slot 3 of the tick before [s of the diagram]
 HEALTH_TICKS = 4  # health is reported every 1/32 s
 PATIENCE = {"robot": 0.1}  # of devices that do not report every tick (reports.py) [s]
 PATIENCE |= dict.fromkeys(CAMERAS, 0.5) | {f"{camera} late": 0.9 for camera in CAMERAS}
-NOTICE = 2.0  # a wait for the robot that takes longer is told [s]
+NOTICE = 2.0  # the user is told of a wait for the robot that takes longer [s]
 
 
 @dc.dataclass
 class _Report:
-    """The last news of one device."""
+    """The last report of one device that was news."""
 
     arrival: float  # [s] of the receiver's clock
     values: Any
@@ -106,7 +106,7 @@ class Snapshot:
         return self
 
 
-BEFORE = Snapshot(  # the station was initialised
+BEFORE = Snapshot(  # what the ports show until the station is initialised
     {s.name: np.full(s.kind, np.nan) for s in CONTRACT if s.direction == "out" and isinstance(s.kind, int)},
     dict.fromkeys(CAMERAS),
     Health(),
@@ -162,7 +162,7 @@ class RobotLink:
         self._lockstep = Lockstep()
         self._requests = CameraRequests()
         self._images: dict[str, collections.deque[_Image]] = {c: collections.deque(maxlen=4) for c in CAMERAS}
-        self._placed: dict[int, float] = {}  # utime of a capture -> time on this side
+        self._capture_time: dict[int, float] = {}  # utime of a capture -> time on this side
         self._time = 0.0  # of the tick that looks at what arrives now [s of the diagram]
         self._answered = -1  # the last tick whose commands were sent
         self._health = Health()
@@ -217,7 +217,7 @@ class RobotLink:
             self._bad.bad(row.device, f"{row.device}: not finite", arrival, at_once=True)
             if last is None or key not in NEVER_STILL:
                 return
-            arrival = last.arrival  # the port shows NaN all the same: an unknown force must not look known
+            arrival = last.arrival  # the port shows NaN nevertheless: an unknown force must not look known
         else:
             self._bad.good(row.device, arrival)
             if last is not None and _frozen(key, values, last.values):
@@ -231,16 +231,16 @@ class RobotLink:
         if not self._is_news(key, utime):
             return
         kept, last = self._images[camera], self._reports.get(key)
-        if kept and kept[-1].data == data:  # a frozen camera has nothing to say
+        if kept and kept[-1].data == data:  # the camera is frozen
             return
         least = self._delay.least()
         if least is None:  # the robot's clock is not known
             return
-        time = self._placed.setdefault(utime, from_utime(utime) + least)
-        while len(self._placed) > 64:
-            self._placed.pop(next(iter(self._placed)))
+        time = self._capture_time.setdefault(utime, from_utime(utime) + least)
+        while len(self._capture_time) > 64:
+            self._capture_time.pop(next(iter(self._capture_time)))
         late = self._time - time
-        if late > self._config.image_age:  # nobody would be shown it: no news
+        if late > self._config.image_age:  # too old to be shown to any block
             words = f"{camera}: images come {late:.1f} s after they were taken, want {self._config.image_age:g} s"
             self._bad.bad(f"{camera} late", words, now)
             return

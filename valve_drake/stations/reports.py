@@ -123,18 +123,18 @@ class Senders:
     """Who speaks for a role ("robot", "controller"): every process says its own random number."""
 
     def __init__(self) -> None:
-        self._heard: dict[str, dict[float, float]] = collections.defaultdict(dict)  # role -> number -> when
+        self._last_heard: dict[str, dict[float, float]] = collections.defaultdict(dict)  # role -> number -> when
 
     def hear(self, role: str, instance: float, time: float) -> None:
         """Somebody has said that it is there."""
-        here = self._heard[role]
+        here = self._last_heard[role]
         here[instance] = time
         for gone in [number for number, when in here.items() if time - when > PRESENT]:
             del here[gone]
 
     def present(self, role: str, time: float) -> int:
         """How many there are now."""
-        return sum(time - when <= PRESENT for when in self._heard[role].values())
+        return sum(time - when <= PRESENT for when in self._last_heard[role].values())
 
 
 class LeastDelay:
@@ -173,7 +173,7 @@ class Lockstep:
     def __init__(self) -> None:
         self.tick: int | None = None  # that the other end has announced last; None: it does not run in lock-step
         self._announced = 0  # messages since the start, by the other end's count
-        self._heard = 0  # the same by our own
+        self._received = 0  # the same as counted here
         self._sent_before = 0
 
     def hear(self, message: Any) -> bool:
@@ -182,22 +182,22 @@ class Lockstep:
             return False
         self.tick, self._announced = (int(v) for v in message.val)
         if self.tick < 0:  # what comes before the start does not count
-            self._heard = 0
+            self._received = 0
         return True
 
     def count(self) -> None:
         """A message of the table has come."""
-        self._heard += 1
+        self._received += 1
 
     def begin(self, sent: int) -> None:
         """What was sent, `sent` messages, and heard before the start does not count."""
-        self._sent_before, self._heard = sent, 0
+        self._sent_before, self._received = sent, 0
 
     def complete(self, tick: int) -> bool:
         """Whether all messages of a tick are here. What came beyond them is no longer counted."""
-        if self.tick != tick or self._heard < self._announced:
+        if self.tick != tick or self._received < self._announced:
             return False
-        self._heard = self._announced
+        self._received = self._announced
         return True
 
     def announcement(self, tick: int, sent: int) -> dict[str, float]:
@@ -206,4 +206,4 @@ class Lockstep:
 
     def progress(self) -> str:
         """For people: how far the tick has come."""
-        return f"at tick {self.tick} with {self._heard} of {self._announced} messages"
+        return f"at tick {self.tick} with {self._received} of {self._announced} messages"

@@ -30,7 +30,7 @@ from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
 
 TORSO = ("waist", "neck_pitch", "neck_yaw")
 BASE = ("base_x", "base_y", "base_yaw")
-STEP = 2 * SLOT  # of the plant; half of it gives the same forces and angles for twice the work [s]
+STEP = 2 * SLOT  # of the plant [s]; halving it leaves forces and angles as they are and doubles the work
 FINGER_STIFFNESS = 2e4  # of the finger servo, as in the model file [N/m]
 
 
@@ -39,10 +39,11 @@ def arm_joints(side: str) -> list[str]:
 
 
 class ServoDriver(LeafSystem):
-    """What must be computed at every step of the plant: set points of the base and of the fingers.
+    """Computes the set points of the base and of the fingers, which change at every step of the plant.
 
-    The base integrates its twist; a gripper's force limit is kept by never asking for a position farther away than
-    the servo answers with that force. Output: q_d of base x, y, heading, left and right finger, then their v_d (10).
+    The base's is the integral of its twist. A finger's is clipped about the measured position, so that the servo's
+    stiffness times the difference never exceeds the gripper's force limit.
+    Output (10,): q_d of base x, y, heading, left and right finger, then their v_d.
     """
 
     def __init__(self, fingers: list[int], states: int, start: np.ndarray):
@@ -143,12 +144,12 @@ def _add_servos(
 
 
 def _rng(seed: int, stream: int) -> np.random.Generator:
-    """Random numbers that depend on nothing but these two."""
+    """The random generator of one source of errors: it depends on the seed and the source's number alone."""
     return np.random.Generator(np.random.SFC64([seed, 1000 + stream]))
 
 
 class _Noise:
-    """Rows of white noise by their number: a function of the seed, so that it needs no state."""
+    """A table of white noise: row `count` depends on the seed and `count` alone, so that no generator state is kept."""
 
     def __init__(self, seed: int, stream: int, width: int):
         self._rows = _rng(seed, stream).standard_normal((1 << 16, width))
@@ -236,7 +237,7 @@ class WrenchSensorSystem(Block[WrenchSensorInputs, int]):
 
 
 class HealthSystem(Block[Inputs, None]):
-    """The simulated machine reports that all its devices speak."""
+    """Reports that all devices work and were heard just now: the simulated machine has no faults of its own."""
 
     OUTPUTS = {"health": Health}
     DEVICES = tuple(device for device in DEVICES if device != "robot")
@@ -305,7 +306,7 @@ def true_head(head: StereoHead, error: ErrorConfig, seed: int) -> dict[str, Moun
     mount = make(rotation(error.head_mount * rng.standard_normal(3)), np.zeros(3))
     wobble = error.head_rotation * rng.standard_normal(3)
     wobble[1] = error.head_yaw * rng.standard_normal()  # about y of the camera: relative yaw
-    # Both cameras sit on the left camera's frame: the right one where the calibration has it, give or take.
+    # Both cameras are mounted on the left camera's frame: the right one at X_LR of the calibration, with errors.
     right = compose(mount, head.X_LR, make(rotation(wobble), np.zeros(3)))
     return {
         "head_left": Mount(head.left, "head_left_camera", mount),
@@ -314,7 +315,7 @@ def true_head(head: StereoHead, error: ErrorConfig, seed: int) -> dict[str, Moun
 
 
 def wrist_lens(focal: float) -> Lens:
-    """The wrist cameras' wide lens. Nothing else in the program knows it."""
+    """The wrist cameras' wide lens. No controller reads it: to them the wrist cameras are not calibrated."""
     return Lens(k_u=6e-7, k_v=6e-7, k_x=focal, k_y=focal, u_0=316.0, v_0=243.0)
 
 
@@ -337,7 +338,7 @@ def rig_arguments(
 
 @dc.dataclass(frozen=True)
 class Joints:
-    """Where joints lie in the plant's state and actuation."""
+    """Indices of joints in the plant's state and actuation."""
 
     plant: MultibodyPlant
     scene: Scene
@@ -473,7 +474,7 @@ def make_simulated_station(
 
 
 def _leave_out_looks(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Removes what only looks: physics would carry it along at every step, and the cameras have their own scene."""
+    """Removes the visual geometry: it would cost time at every step, and the cameras render a scene of their own."""
     inspector = scene_graph.model_inspector()
     source = plant.get_source_id()
     assert source is not None

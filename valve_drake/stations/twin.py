@@ -59,19 +59,19 @@ from valve_drake.stations.reports import BadMessages, Lockstep, Stamps
 from valve_drake.stations.simulation_config import CameraConfig
 
 VECTORS = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and isinstance(spec.kind, int))
-FAULT_TIME = 0.5  # a refused command is reported for as long [s]
-REQUEST_AGE = 0.5  # of a camera request before the cameras stop [s]
-FAR = 0.5  # from the measured position, a joint's command is absurd [rad]
-FAST = (2.0, 3.0)  # base twist that is absurd [m/s, rad/s]
-GRIP = (0.2, 200.0)  # opening and force that are absurd [m, N]
+FAULT_TIME = 0.5  # a refused command is reported as a fault for this long [s]
+REQUEST_AGE = 0.5  # cameras stop when the last request for them is older [s]
+FAR = 0.5  # a joint command farther from the measured position is refused [rad]
+FAST = (2.0, 3.0)  # a faster base twist is refused [m/s, rad/s]
+GRIP = (0.2, 200.0)  # a larger opening or force is refused [m, N]
 ARM_SPEED = (1.5, 1.5, 1.5, 2.5, 2.5, 2.5)
 SPEED = {"torso": (1.0, 2.0, 2.0), "left_arm": ARM_SPEED, "right_arm": ARM_SPEED}  # of the joints, at most [rad/s]
 BEHIND = 0.1  # a joint whose limited motion is farther behind its command is reported [rad]
 BACK = 0.3  # speed of a joint that was stopped, back to its commands [rad/s]
-GONE = 3.0  # paced: a program that was silent for so long has gone [s]
-IDLE = 0.05  # lock-step: between two reports before the start [s, wall]
+GONE = 3.0  # paced: a program that was silent for this long counts as gone; raise it for a slow one [s]
+IDLE = 0.05  # lock-step: time between two reports before the start [s, wall clock]
 PATIENCE = {"cameras": 0.1, "controller": math.inf}  # of what does not come every tick (reports.py) [s]
-STARTING = 3.0  # the first images take longer on a busy machine: it is told [s]
+STARTING = 3.0  # the user is told if the first images take longer than this [s, wall clock]
 
 
 class LiveImages(CameraWorkers):
@@ -80,7 +80,7 @@ class LiveImages(CameraWorkers):
     def __init__(self, *rig: Any) -> None:
         super().__init__(*rig)
         self.wanted: set[str] = set()
-        self._unmade = set(CAMERAS)  # whose first image, that nobody has asked for, is not there yet
+        self._unmade = set(CAMERAS)  # cameras whose first image, which is made unasked, is not there yet
 
     def settle(self, stop: Callable[[], bool], notice: Callable[[str], None]) -> None:
         """Waits for the first images, which take a renderer seconds, or until `stop`. notice: tells the user."""
@@ -92,7 +92,7 @@ class LiveImages(CameraWorkers):
                 told = True
                 missing = ", ".join(camera for camera in CAMERAS if camera in self._unmade)
                 notice(f"the twin waits for its renderers: no image yet of {missing}")
-        if hasattr(os, "SCHED_IDLE"):  # Linux: rather a late image than a late tick of either side
+        if hasattr(os, "SCHED_IDLE"):  # Linux: a late image is better than a late tick of either side
             for worker in self._workers:
                 os.sched_setscheduler(worker.pid, os.SCHED_IDLE, os.sched_param(0))
 
@@ -115,11 +115,11 @@ class LiveImages(CameraWorkers):
 
 
 class Guard:
-    """The robot's own judgement of commands: what the joints are really told."""
+    """The robot's own check of commands; it decides what the joints are sent."""
 
     def __init__(self, start: Mapping[str, np.ndarray], age: float):
         """start: port -> vector: what holds until the first command. age: of commands [s]."""
-        self._told = dict(start)
+        self._commanded = dict(start)
         self._targets = dict(start)  # what the joints were told last
         self._behind: set[str] = set()  # channels whose command is farther ahead than the joints' speed allows
         self._arrived: dict[str, float] = {}
@@ -132,11 +132,11 @@ class Guard:
         if problem := _problem(CHANNELS[key].device, values, measured):
             self.refuse(key, problem, time)
             return
-        self._told |= values
+        self._commanded |= values
         self._arrived[key] = time
 
     def refuse(self, key: str, problem: str, time: float) -> None:
-        """A command that counts as none."""
+        """Reports a command that is ignored."""
         self._refused[key] = (problem, time)
 
     def _late(self, key: str, time: float) -> bool:
@@ -147,16 +147,16 @@ class Guard:
 
         A joint that was stopped goes slowly to where it is commanded afterwards, however far that is by then.
         """
-        targets = dict(self._told)
+        targets = dict(self._commanded)
         for row in COMMANDS:
             if row.device.endswith("gripper"):
                 continue
             stop = estop or self._late(row.key, time)
             if row.device == "base":
-                targets["base.twist_command"] = np.zeros(2) if stop else self._told["base.twist_command"]
+                targets["base.twist_command"] = np.zeros(2) if stop else self._commanded["base.twist_command"]
                 continue
             port = f"{row.device}.position_"
-            goal, stopped = self._told[port + "command"], row.key in self._stopped
+            goal, stopped = self._commanded[port + "command"], row.key in self._stopped
             if stop:
                 target = self._targets[port + "command"] if stopped else measured[port + "measured"]
                 self._stopped.add(row.key)
@@ -171,7 +171,7 @@ class Guard:
         return targets
 
     def faults(self, time: float) -> list[str]:
-        """What the robot says of the commands."""
+        """Faults of the commands, one line each."""
         words = [f"{row.key} late" for row in COMMANDS if self._late(row.key, time)]
         words += [f"{row.key} faster than the joints may move" for row in COMMANDS if row.key in self._behind]
         return words + [f"{key} refused: {p}" for key, (p, when) in self._refused.items() if time - when <= FAULT_TIME]
@@ -331,7 +331,7 @@ class Twin:
     def _say(self, key: str, message: Any) -> None:
         if self._started:
             self._out.put(key, message, self.time)
-        else:  # time stands still: nothing is late, and chance has not begun
+        else:  # before the start time stands still: no latency, and no random fault yet
             self._bus.send(key, message)
 
     def _sense(self) -> Values:
