@@ -11,8 +11,9 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
+from valve_drake.memory import lock
 from valve_drake.messages import Health, Mode, ModeState, Status, StereoPosition
-from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs, lock
+from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs
 
 
 class CounterInputs(Inputs):

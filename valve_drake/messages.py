@@ -23,13 +23,18 @@ def array(*shape: int, fill: float = 0.0, optional: bool = False) -> Any:
     metadata = {"shape": shape, "optional": optional}
     if optional:
         return dc.field(default=None, metadata=metadata)
-    full = tuple(0 if n < 0 else n for n in shape)
-    return dc.field(default_factory=lambda: np.full(full, fill), metadata=metadata)
+    return _shared(np.full(tuple(0 if n < 0 else n for n in shape), fill), metadata)
 
 
 def transform() -> Any:
     """A field for a rigid transform X as its 3x4 matrix [R | p]; identity by default."""
-    return dc.field(default_factory=lambda: np.eye(3, 4), metadata={"shape": (3, 4), "optional": False})
+    return _shared(np.eye(3, 4), {"shape": (3, 4), "optional": False})
+
+
+def _shared(default: np.ndarray, metadata: dict[str, Any]) -> Any:
+    """A field whose default all messages share: it is read-only."""
+    default.setflags(write=False)
+    return dc.field(default_factory=lambda: default, metadata=metadata)
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -37,20 +42,24 @@ class Message:
     """Base of all messages. Array fields are checked for shape and made read-only."""
 
     def __post_init__(self) -> None:
+        values = self.__dict__
         for name, shape, optional in _array_fields(type(self)):
-            value = getattr(self, name)
+            value = values[name]
             if value is None and optional:
                 continue
             frozen = type(value) is np.ndarray and value.base is None and not value.flags.writeable
-            if not (frozen and value.dtype == np.float64):  # immutable arrays are shared, not copied
-                value = np.array(value, dtype=np.float64)
-            if value.shape != shape:  # an array of the field's own fixed shape needs no check
-                if value.size == 0 and -1 in shape:
-                    value = value.reshape([0 if n < 0 else n for n in shape])
-                if value.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, value.shape)):
-                    raise ValueError(f"{type(self).__name__}.{name} must have shape {shape}, got {value.shape}")
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+            if not (frozen and value.dtype == _DOUBLE):  # immutable arrays are shared, not copied
+                value = np.array(value, dtype=_DOUBLE)
+                value.setflags(write=False)
+                values[name] = value
+            if value.shape == shape:  # an array of the field's own fixed shape needs no check
+                continue
+            if value.size == 0 and -1 in shape:
+                value = value.reshape([0 if n < 0 else n for n in shape])
+                value.setflags(write=False)
+                values[name] = value
+            if value.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, value.shape)):
+                raise ValueError(f"{type(self).__name__}.{name} must have shape {shape}, got {value.shape}")
 
     def __copy__(self) -> Self:
         return self
@@ -59,15 +68,17 @@ class Message:
         return self
 
 
+_DOUBLE = np.dtype(np.float64)
 _ARRAY_FIELDS: dict[type, list[tuple[str, tuple[int, ...], bool]]] = {}
 
 
 def _array_fields(kind: type) -> list[tuple[str, tuple[int, ...], bool]]:
-    if kind not in _ARRAY_FIELDS:
-        _ARRAY_FIELDS[kind] = [
+    fields = _ARRAY_FIELDS.get(kind)
+    if fields is None:
+        fields = _ARRAY_FIELDS[kind] = [
             (f.name, f.metadata["shape"], f.metadata["optional"]) for f in dc.fields(kind) if "shape" in f.metadata
         ]
-    return _ARRAY_FIELDS[kind]
+    return fields
 
 
 # ---------------------------------------------------------------- station

@@ -47,7 +47,7 @@ def follow(
     gap = target - position
     side = np.sign(gap)
     distance = np.abs(gap)
-    lead = np.clip(side * target_velocity, 0.0, speed)
+    lead = np.minimum(np.maximum(side * target_velocity, 0.0), speed)  # np.clip takes twice as long
     brake = lead + braking_speed(np.maximum(distance - lead * dt, 0.0), acceleration, dt)
     reach = np.minimum(np.minimum(np.maximum(side * velocity, 0.0) + acceleration * dt, speed), brake) * dt
     new = np.where(reach >= distance, target, position + side * reach)

@@ -29,18 +29,18 @@ slot 3 and cannot delay them.
 Every block uses UNRESTRICTED updates: a discrete update would see the plant already stepped.
 """
 
-import dataclasses as dc
 import functools
 import types
 import typing
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Generic, TypeAlias, TypeVar, Union
+from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar, Union
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, InputPort, LeafSystem, State
 
 from valve_drake import profiling
+from valve_drake.memory import lock
 from valve_drake.messages import Message
 
 TICK = 1 / 128  # control period [s]
@@ -85,8 +85,8 @@ class Inputs:
             cls.PORTS[name] = kind = _kind(hint)
             setattr(cls, name, _Port(name, kind, cls.__dict__.get(name, _REQUIRED)))
 
-    def __init__(self, block: "Block[Any, Any]", context: Context):
-        self._block = block
+    def __init__(self, sources: "dict[str, _Source]", context: Context):
+        self._sources = sources
         self._context = context
 
     def __getitem__(self, name: str) -> Any:
@@ -98,19 +98,27 @@ class Inputs:
 
         Raises RuntimeError when nothing is connected and there is no default, TypeError for a wrong message.
         """
-        port, kind = self._block.input_ports[name]
+        port, evaluate, kind = self._sources[name]
         try:
-            value = port.Eval(self._context)
+            value = evaluate(self._context)
         except RuntimeError as error:
             if port.HasValue(self._context):  # the error is the source's; asking before would evaluate it twice
                 raise
             if default is _REQUIRED:
                 raise RuntimeError(f"{port.GetFullDescription()}: nothing is connected") from error
             return default
-        if isinstance(kind, type) and not isinstance(value, kind):
+        if not isinstance(value, kind):
             # Connect() cannot check this: Drake sees every Python message as Value[object].
             raise TypeError(f"{port.GetFullDescription()}: want {kind.__name__}, got {type(value).__name__}")
         return value
+
+
+class _Source(NamedTuple):
+    """An input port of a block."""
+
+    port: InputPort
+    evaluate: Callable[[Context], Any]  # port.Eval, looked up once
+    kind: type  # of its values; object where Drake checks it
 
 
 def _kind(hint: Any) -> Kind:
@@ -153,16 +161,16 @@ class Block(LeafSystem, Generic[In, M]):
         super().__init__()
         self.set_name(name)
         self._name = name
-        self.input_ports: dict[str, tuple[InputPort, Kind]] = {}
+        self._sources: dict[str, _Source] = {}
         for port, kind in {**self._inputs.PORTS, **self.INPUTS}.items():
             if isinstance(kind, int):
                 declared = self.DeclareVectorInputPort(port, kind)
             else:
                 model = Value(kind()) if isinstance(kind, type) else kind
                 declared = self.DeclareAbstractInputPort(port, model)
-            self.input_ports[port] = (declared, kind)
-        self._memory = self.DeclareAbstractState(Value(_Held(self.initial())))
-        self._held: dict[str, Any] = {}
+            self._sources[port] = _Source(declared, declared.Eval, kind if isinstance(kind, type) else object)
+        self._memory = int(self.DeclareAbstractState(Value(_Held(self.initial()))))
+        self._held: dict[str, int] = {}  # output port -> index of its state
         for port, kind in self.OUTPUTS.items():
             if isinstance(kind, int):
                 index = self.DeclareDiscreteState(kind)
@@ -170,7 +178,7 @@ class Block(LeafSystem, Generic[In, M]):
                 index = self.DeclareAbstractState(Value(kind()))
             else:
                 raise TypeError(f"{name}.{port}: an output is a message class or the size of a vector")
-            self._held[port] = index
+            self._held[port] = int(index)
             self.DeclareStateOutputPort(port, index)
         self.period = period
         works: list[tuple[int, Step]] = [(slot, self.step)]
@@ -194,29 +202,30 @@ class Block(LeafSystem, Generic[In, M]):
 
     def memory(self, context: Context) -> M:
         """The memory in this Context, for tests and reports."""
-        held: _Held = context.get_abstract_state(int(self._memory)).get_value()
+        held: _Held = context.get_abstract_state(self._memory).get_value()
         memory: M = held.value
         return memory
 
     def _update(self, work: "Step", context: Context, state: State) -> None:
-        inputs = self._inputs(self, context)
+        inputs = self._inputs(self._sources, context)
+        held: _Held = context.get_abstract_state(self._memory).get_value()
         activation = None
         if self.AWAKE is not None:
             mode = inputs.read("mode", _REQUIRED)
             if mode.mode not in self.AWAKE:
                 activation = mode.activation
-                if context.get_abstract_state(int(self._memory)).get_value().asleep == activation:
+                if held.asleep == activation:
                     return
         with profiling.work(profiling.STAGE, self._name):
-            memory, outputs = work(context.get_time(), inputs, self.memory(context))
+            memory, outputs = work(context.get_time(), inputs, held.value)
         abstract = state.get_mutable_abstract_state()
-        abstract.get_mutable_value(int(self._memory)).set_value(_Held(memory, activation))
+        abstract.get_mutable_value(self._memory).set_value(_Held(memory, activation, held.value))
         for port, value in outputs.items():
             kind = self.OUTPUTS[port]
             if isinstance(kind, int):
-                state.get_mutable_discrete_state(int(self._held[port])).SetFromVector(np.asarray(value, float))
+                state.get_mutable_discrete_state(self._held[port]).SetFromVector(np.asarray(value, float))
             elif isinstance(kind, type) and isinstance(value, kind):
-                abstract.get_mutable_value(int(self._held[port])).set_value(value)
+                abstract.get_mutable_value(self._held[port]).set_value(value)
             else:
                 raise TypeError(f"{self.get_name()}.{port}: want {kind}, got {type(value).__name__}")
 
@@ -225,30 +234,17 @@ Step = Callable[[float, Any, Any], tuple[Any, Outputs]]
 
 
 class _Held:
-    """Carries a block's memory through Drake's state copies without copying it: its arrays are locked, so that no step
-    of one Context can change what a clone holds too."""
+    """Carries a block's memory through Drake's state copies without copying it; its arrays are locked.
+
+    before: the memory that this one replaces.
+    """
 
     __slots__ = ("asleep", "value")
 
-    def __init__(self, value: Any, asleep: int | None = None):
-        lock(value)
+    def __init__(self, value: Any, asleep: int | None = None, before: Any = None):
+        lock(value, before)
         self.value = value
         self.asleep = asleep  # the activation of a mode that has had its one step; None: awake
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "_Held":
         return self
-
-
-def lock(value: Any) -> None:
-    """Makes every array in a memory read-only: in dataclasses, tuples, lists and dicts. Messages lock their own."""
-    if isinstance(value, np.ndarray):
-        value.setflags(write=False)
-    elif isinstance(value, tuple | list):
-        for part in value:
-            lock(part)
-    elif isinstance(value, dict):
-        for part in value.values():
-            lock(part)
-    elif dc.is_dataclass(value) and not isinstance(value, Message | type):
-        for part in vars(value).values():
-            lock(part)

@@ -44,8 +44,11 @@ class RobotStateSystem(Block[Inputs, np.ndarray]):
     def step(self, time: float, inputs: Inputs, memory: np.ndarray) -> tuple[np.ndarray, Outputs]:
         read = {name: inputs[name] for name in self.INPUTS}
         odometry, torso = read["base.odometry"], read["torso.position_measured"]
-        row = np.concatenate([[time], odometry[:3], torso])
-        history = np.vstack([memory[-(HISTORY - 1) :], row])
+        kept = memory[-(HISTORY - 1) :]
+        history = np.empty((len(kept) + 1, 7))
+        history[:-1] = kept
+        history[-1] = (time, *odometry[:3], *torso)
+        history.setflags(write=False)  # or the message would copy it
         sides: dict[str, Any] = {}
         for side in SIDES:
             sides[f"{side}_arm"] = read[f"{side}_arm.position_measured"]

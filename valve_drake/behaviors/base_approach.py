@@ -27,6 +27,7 @@ import numpy as np
 from valve_drake.checks import require
 from valve_drake.config import Config, number
 from valve_drake.frames import apply, compose, wrap
+from valve_drake.memory import changed
 from valve_drake.messages import (
     Command,
     Mode,
@@ -152,7 +153,7 @@ def step(
         # The twist goes on from where it is, so that two approaches in a row join smoothly.
         fresh = MedianPlace(seen=time)
         m = Memory(mode.activation, time, twist=m.twist, start=base, quiet_since=time)
-        m = dc.replace(m, marker=fresh, panel=fresh, stance=fresh)
+        m = changed(m, marker=fresh, panel=fresh, stance=fresh)
     goal = np.zeros(2)
     if m.result == "running":
         if mode.mode == Mode.ROUGH_APPROACH:
@@ -161,7 +162,7 @@ def step(
             m, goal = _fine(config, marker, m, time, dt, robot_state, estimate, stance)
         else:
             m, goal = _retreat(config, m, time, dt, robot_state)
-    m = dc.replace(m, twist=slew(m.twist, goal, np.array([config.acceleration, config.yaw_acceleration]) * dt))
+    m = changed(m, twist=slew(m.twist, goal, np.array([config.acceleration, config.yaw_acceleration]) * dt))
     status = Status(time, m.activation, m.result, m.verdict, m.detail, m.progress)
     return m, Command(time=time, base_twist=m.twist), status
 
@@ -171,7 +172,7 @@ def step(
 
 def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") -> tuple[Memory, np.ndarray]:
     progress = 1.0 if result == "succeeded" else m.progress
-    return dc.replace(m, result=result, verdict=str(verdict), detail=detail, progress=progress), np.zeros(2)
+    return changed(m, result=result, verdict=str(verdict), detail=detail, progress=progress), np.zeros(2)
 
 
 def _drive(config: BaseApproachConfig, gap: float, speed: float, dt: float) -> float:
@@ -202,7 +203,7 @@ def _rough(
 ) -> tuple[Memory, np.ndarray]:
     if position.found and position.time > m.marker.seen:
         p_OV = apply(position.X_OL, position.p_LV)
-        m = dc.replace(m, marker=m.marker.add(position.time, np.array([p_OV[0], p_OV[1], 0.0]), config.sightings))
+        m = changed(m, marker=m.marker.add(position.time, np.array([p_OV[0], p_OV[1], 0.0]), config.sightings))
     if not m.marker.places:
         return m, np.zeros(2)
     x, y, heading = state.odometry[:3]
@@ -212,7 +213,7 @@ def _rough(
         return m, np.zeros(2)
     distance = float(np.hypot(p[0] - x, p[1] - y))
     bearing = wrap(float(np.arctan2(p[1] - y, p[0] - x)) - heading)
-    m = dc.replace(
+    m = changed(
         m,
         detail=f"marker {distance:.2f} m away",
         progress=float(np.clip(config.rough_distance / distance, 0, 1)),
@@ -233,7 +234,7 @@ def _watch_odometry(config: BaseApproachConfig, m: Memory, base: np.ndarray) -> 
     """
     marker = m.marker.median[:2]
     if m.first_seen is None:
-        return dc.replace(m, first_seen=np.concatenate([marker, base])) if _sure(config, m.marker) else m
+        return changed(m, first_seen=np.concatenate([marker, base])) if _sure(config, m.marker) else m
     driven = float(np.linalg.norm(base - m.first_seen[2:]))
     moved = float(np.linalg.norm(marker - m.first_seen[:2]))
     if driven < config.odometry_check or moved < config.odometry_error * driven:
@@ -271,13 +272,13 @@ def _fine(
     stance: Stance,
 ) -> tuple[Memory, np.ndarray]:
     if estimate.found and estimate.time > m.panel.seen:
-        m = dc.replace(m, panel=m.panel.add(estimate.time, _panel(marker, estimate), config.sightings))
+        m = changed(m, panel=m.panel.add(estimate.time, _panel(marker, estimate), config.sightings))
     if stance.found and stance.time > m.stance.seen:
-        m = dc.replace(m, stance=m.stance.add(stance.time, stance.base, config.sightings))
+        m = changed(m, stance=m.stance.add(stance.time, stance.base, config.sightings))
     if not (_sure(config, m.panel) and _sure(config, m.stance)):
         if time - m.since > config.stance_patience:
             return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
-        return dc.replace(m, detail="waiting for a stance"), np.zeros(2)
+        return changed(m, detail="waiting for a stance"), np.zeros(2)
     goal, panel = m.stance.median, m.panel.median
     room = -_offset(goal, panel).s - config.clearance
     if room < 0:
@@ -285,7 +286,7 @@ def _fine(
     base = state.odometry[:3]
     at = _offset(base, goal)
     if m.phase != "settle":
-        m = dc.replace(m, quiet_since=time)  # stillness counts from there on
+        m = changed(m, quiet_since=time)  # stillness counts from there on
     if m.phase == "plan":
         m = _plan(config, m, base, goal, at, _ahead(panel, -marker.panel_depth))
         if m.result == "failed":
@@ -295,7 +296,7 @@ def _fine(
     else:
         m, twist = PHASES[m.phase](config, m, dt, base, goal, at)
     if m.result == "running":
-        m = dc.replace(m, detail=f"{m.phase}: {-at.s:.3f} m to go, {at.e:+.3f} m aside, {np.degrees(at.psi):+.1f} deg")
+        m = changed(m, detail=f"{m.phase}: {-at.s:.3f} m to go, {at.e:+.3f} m aside, {np.degrees(at.psi):+.1f} deg")
     return m, twist
 
 
@@ -324,22 +325,22 @@ def _plan(
 ) -> Memory:
     """Chooses the first phase of a new attempt. marker: its centre on the floor (2,)."""
     if _within(config, at):
-        return dc.replace(m, phase="settle")
+        return changed(m, phase="settle")
     if m.attempt >= config.attempts:
         return _end(m, "failed", Verdict.REACH_LIMIT, f"still {at.e:+.3f} m aside after {m.attempt} attempts")[0]
-    m = dc.replace(m, attempt=m.attempt + 1)
+    m = changed(m, attempt=m.attempt + 1)
     # In the funnel before the stance the line law alone brings it in.
     if -2 * config.pre_stance < at.s < 0 and abs(at.e) < -at.s / 8 and abs(at.psi) < config.facing:
-        return dc.replace(m, phase="line")
+        return changed(m, phase="line")
     way = _pre_stance(config, goal) - base[:2]
     if np.linalg.norm(way) < 0.05:
-        return dc.replace(m, phase="align")
+        return changed(m, phase="align")
     # The widest angle between the robot's front and the marker on the way, for driving forwards and backwards.
     lines = [marker - base[:2], marker - base[:2] - way]
     course = np.arctan2(way[1], way[0])
     angles = [abs(wrap(float(np.arctan2(line[1], line[0]) - course))) for line in lines]
     forwards, backwards = max(angles), np.pi - min(angles)
-    return dc.replace(m, phase="turn", direction=1.0 if forwards <= backwards + 0.1 else -1.0)
+    return changed(m, phase="turn", direction=1.0 if forwards <= backwards + 0.1 else -1.0)
 
 
 def _course_error(m: Memory, base: np.ndarray, way: np.ndarray) -> float:
@@ -353,7 +354,7 @@ def _turn_phase(
 ) -> tuple[Memory, np.ndarray]:
     error = _course_error(m, base, _pre_stance(config, goal) - base[:2])
     if abs(error) < 0.05 and abs(m.twist[1]) < 0.2:
-        return dc.replace(m, phase="drive"), np.zeros(2)
+        return changed(m, phase="drive"), np.zeros(2)
     return m, np.array([0.0, _turn(config, error, dt)])
 
 
@@ -363,13 +364,13 @@ def _drive_phase(
     way = _pre_stance(config, goal) - base[:2]
     left = m.direction * float(way @ [np.cos(base[2]), np.sin(base[2])])
     if left < 0.02:
-        return dc.replace(m, phase="align"), np.zeros(2)
+        return changed(m, phase="align"), np.zeros(2)
     error = _course_error(m, base, way)
     speed = config.fine_speed if m.direction > 0 else config.reverse_speed
     # Close to the point its direction swings round; the heading is kept there.
     rate = _turn(config, error, dt) if np.linalg.norm(way) > 0.15 else 0.0
     if abs(error) > config.facing and np.linalg.norm(way) > 0.15:
-        return dc.replace(m, phase="turn"), np.array([0.0, rate])
+        return changed(m, phase="turn"), np.array([0.0, rate])
     return m, np.array([m.direction * _drive(config, left, speed, dt), rate])
 
 
@@ -378,7 +379,7 @@ def _align_phase(
 ) -> tuple[Memory, np.ndarray]:
     if abs(at.psi) < 0.03 and abs(m.twist[1]) < 0.1:
         # Too far aside for the line law: a new attempt.
-        return dc.replace(m, phase="line" if abs(at.e) < config.pre_stance / 5 else "plan"), np.zeros(2)
+        return changed(m, phase="line" if abs(at.e) < config.pre_stance / 5 else "plan"), np.zeros(2)
     return m, np.array([0.0, _turn(config, -at.psi, dt)])
 
 
@@ -386,7 +387,7 @@ def _line_phase(
     config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
     if at.s > -0.005:
-        return dc.replace(m, phase="settle"), np.zeros(2)
+        return changed(m, phase="settle"), np.zeros(2)
     psi_ref = float(-np.arctan(at.e / config.look_ahead))
     rate = float(np.clip(config.steering * wrap(psi_ref - at.psi), -config.yaw_rate, config.yaw_rate))
     return m, np.array([_drive(config, -at.s, config.line_speed, dt), rate])
@@ -403,12 +404,12 @@ def _settle(
     shift = abs(at.s) > config.position_tolerance / 3
     busy = turn or (shift and abs(at.e) < config.position_tolerance)
     if busy or not _still(config, state):
-        m = dc.replace(m, quiet_since=time)
+        m = changed(m, quiet_since=time)
     elif time - m.quiet_since >= config.still_time:
         if _within(config, at):
             detail = f"{1e3 * at.s:+.0f} mm along, {1e3 * at.e:+.0f} mm aside, {np.degrees(at.psi):+.2f} deg"
             return _end(m, "succeeded", detail=detail)
-        return dc.replace(m, phase="plan"), np.zeros(2)
+        return changed(m, phase="plan"), np.zeros(2)
     rate = _turn(config, -at.psi, dt) if turn else 0.0
     forward = _drive(config, -at.s, config.trim_speed, dt) if shift else 0.0
     return m, np.array([forward, rate])
@@ -426,12 +427,12 @@ def _retreat(
     if m.phase == "plan":
         speed = max(np.max(np.abs(state.left_arm_velocity)), np.max(np.abs(state.right_arm_velocity)))
         if speed > config.arms_still:
-            m = dc.replace(m, quiet_since=time)
+            m = changed(m, quiet_since=time)
         if time - m.quiet_since < config.arms_wait and time - m.since < config.arms_patience:
-            return dc.replace(m, detail="waiting for the arms"), np.zeros(2)
-        m = dc.replace(m, phase="back")
+            return changed(m, detail="waiting for the arms"), np.zeros(2)
+        m = changed(m, phase="back")
     left = config.retreat_distance - back
-    m = dc.replace(m, detail=f"{back:.2f} m back", progress=float(np.clip(back / config.retreat_distance, 0, 1)))
+    m = changed(m, detail=f"{back:.2f} m back", progress=float(np.clip(back / config.retreat_distance, 0, 1)))
     if left < 0.01 and _still(config, state):
         return _end(m, "succeeded", detail=f"{back:.2f} m back")
     rate = _turn(config, wrap(float(m.start[2]) - heading), dt)

@@ -31,6 +31,7 @@ from valve_drake.checks import require
 from valve_drake.config import Config, number
 from valve_drake.frames import cross, make, rotation, wrap
 from valve_drake.kinematics import RobotGeometry
+from valve_drake.memory import changed
 from valve_drake.messages import (
     LEFT,
     RIGHT,
@@ -248,13 +249,13 @@ class HybridRotation:
     ) -> tuple[Memory, Command]:
         """One tick of length dt -> memory (with status and telemetry), command."""
         if mode.mode not in AT_VALVE:
-            idle = memory if memory.activation < 0 else dc.replace(memory, activation=-1, status=Status())
+            idle = memory if memory.activation < 0 else changed(memory, activation=-1, status=Status())
             return idle, Command(time=time)
         q = (state.left_arm, state.right_arm)
         X = (self.geometry.arm_forward(q[0], LEFT), self.geometry.arm_forward(q[1], RIGHT))
         m = self._sense(dt, memory, state, mode, X)
         if mode.mode in (Mode.REACH, Mode.SERVO):  # other blocks move the hands
-            return dc.replace(m, activation=-1, status=Status(), commanding=False), Command(time=time)
+            return changed(m, activation=-1, status=Status(), commanding=False), Command(time=time)
         p = np.array([X[0][:, 3], X[1][:, 3]])
         u = -plan.X_BV[:, 2]  # H and B have the same axes while the waist is at zero
         chain = make_chain(p, m.wrenches, u)
@@ -269,7 +270,7 @@ class HybridRotation:
         m, V, gripper = run(time, dt, m, state, mode, chain)
         V = V if sound else np.zeros((2, 6))
         m = self._move(dt, m, V, chain)
-        m = dc.replace(m, telemetry=self._telemetry(time, m, chain))
+        m = changed(m, telemetry=self._telemetry(time, m, chain))
         command = Command(time=time, left_arm=m.q[0], right_arm=m.q[1], left_gripper=gripper, right_gripper=gripper)
         return m, command
 
@@ -280,11 +281,11 @@ class HybridRotation:
         if mode.mode == Mode.REACH:
             still = max(np.max(np.abs(state.left_arm_velocity)), np.max(np.abs(state.right_arm_velocity))) < 0.02
             if not still or not np.all(np.isfinite(raw)):
-                return dc.replace(m, tared=False) if m.tared else m
+                return changed(m, tared=False) if m.tared else m
             load = np.array([raw[k] - gravity_wrench(X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)])
             a = 1 - np.exp(-dt / self.config.tare_time)
             bias = m.bias + a * (load - m.bias) if m.tared else load
-            return dc.replace(m, bias=bias, tared=True, wrenches=np.zeros((2, 6)))
+            return changed(m, bias=bias, tared=True, wrenches=np.zeros((2, 6)))
         now = np.array(
             [contact_wrench(raw[k], m.bias[k], X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)]
         )
@@ -292,15 +293,15 @@ class HybridRotation:
         last = np.where(
             np.isfinite(m.wrenches), m.wrenches, now
         )  # one report that is not finite must not stay in the filter
-        return dc.replace(m, wrenches=last + a * (now - last))
+        return changed(m, wrenches=last + a * (now - last))
 
     def _begin(self, time: float, m: Memory, mode: ModeState, X: Pair, q: Pair, chain: Chain) -> Memory:
         stage = {Mode.GRASP: "close", Mode.TURN: "turn", Mode.RELEASE: "relax"}[Mode(mode.mode)]
         if mode.mode == Mode.GRASP or not m.commanding:
-            m = dc.replace(m, commanding=True, X=X, q=q, b0=chain.b, turned=0.0, commanded=0.0)
+            m = changed(m, commanding=True, X=X, q=q, b0=chain.b, turned=0.0, commanded=0.0)
         if mode.mode == Mode.TURN:
-            m = dc.replace(m, b0=chain.b, turned=0.0, commanded=0.0)
-        return dc.replace(
+            m = changed(m, b0=chain.b, turned=0.0, commanded=0.0)
+        return changed(
             m,
             activation=mode.activation,
             stage=stage,
@@ -320,7 +321,7 @@ class HybridRotation:
         """Angle of the line between the hands about u since b0, unwrapped."""
         b0 = m.b0 - chain.u * (chain.u @ m.b0)
         now = float(np.arctan2(chain.u @ cross(b0, chain.b), b0 @ chain.b))
-        return dc.replace(m, turned=m.turned + wrap(now - m.turned))
+        return changed(m, turned=m.turned + wrap(now - m.turned))
 
     # ------------------------------------------------------------ grasp
     def _grasp(
@@ -331,18 +332,18 @@ class HybridRotation:
         extra = np.zeros(6)
         if m.stage == "close":
             held = self._held(state)
-            m = dc.replace(m, held_time=m.held_time + dt if held else 0.0)
+            m = changed(m, held_time=m.held_time + dt if held else 0.0)
             if m.held_time >= 0.4:
-                m = dc.replace(m, stage="tug", since=time, start=m.X)
+                m = changed(m, stage="tug", since=time, start=m.X)
             elif time - m.since > c.close_time:
                 m = self._fail(time, m, Verdict.GRASP_MISSED, self._openings(state))
         elif m.stage == "tug":
             pull = -(chain.f @ chain.u)  # the bar holds the hands back: force into the panel
             tugged = (bool(m.tugged[0] or pull[0] >= c.tug_force), bool(m.tugged[1] or pull[1] >= c.tug_force))
-            m = dc.replace(m, tugged=tugged)
+            m = changed(m, tugged=tugged)
             moved = max(float((m.X[k][:, 3] - m.start[k][:, 3]) @ chain.u) for k in range(2))
             if all(tugged):
-                m = dc.replace(m, stage="settle", since=time)
+                m = changed(m, stage="settle", since=time)
             elif moved > c.tug_reach or not self._held(state):
                 detail = f"tug: {pull[0]:.1f} and {pull[1]:.1f} N, {self._openings(state)}"
                 m = self._fail(time, m, Verdict.GRASP_MISSED, detail)
@@ -351,7 +352,7 @@ class HybridRotation:
         elif m.stage == "settle" and time - m.since > c.relax:
             if self._held(state):
                 status = Status(time, m.activation, "succeeded", detail=self._openings(state))
-                m = dc.replace(m, stage="held", status=status)
+                m = changed(m, stage="held", status=status)
             else:
                 m = self._fail(time, m, Verdict.GRASP_MISSED, self._openings(state))
         return m, twists(chain, None, c, extra), gripper
@@ -389,13 +390,13 @@ class HybridRotation:
         if m.stage == "turn" and left <= c.tolerance:
             detail = f"{np.degrees(m.turned):.2f} deg by the hands"
             status = Status(time, m.activation, "succeeded", detail=detail, progress=1.0, value=m.turned)
-            m = dc.replace(m, stage="there", status=status)
+            m = changed(m, stage="there", status=status)
             return m, twists(chain, None, c, np.zeros(6)), gripper
         lead = sense * (m.commanded - m.turned)
         rate = turn_rate(left, m.rate, sense * chain.torque, lead, c, dt)
-        m = dc.replace(m, rate=rate, commanded=m.commanded + sense * rate * dt)
+        m = changed(m, rate=rate, commanded=m.commanded + sense * rate * dt)
         progress = float(np.clip(m.turned / mode.turn_angle, 0, 1))
-        m = dc.replace(m, status=Status(time, m.activation, "running", progress=progress, value=m.turned))
+        m = changed(m, status=Status(time, m.activation, "running", progress=progress, value=m.turned))
         m = self._stall(time, m, sense, left)
         return m, twists(chain, sense * rate, c, np.zeros(6)), gripper
 
@@ -404,10 +405,10 @@ class HybridRotation:
         c = self.config
         since, angle = m.progress_at
         if sense * (m.turned - angle) > c.stall_angle:
-            return dc.replace(m, progress_at=(time, m.turned))
+            return changed(m, progress_at=(time, m.turned))
         if m.stage == "back":
             if left <= c.tolerance:  # free the other way: turn on
-                return dc.replace(m, stage="turn", rate=0.0, progress_at=(time, m.turned), commanded=m.turned)
+                return changed(m, stage="turn", rate=0.0, progress_at=(time, m.turned), commanded=m.turned)
             if time - since > c.stall_time:
                 detail = f"stiff both ways at {np.degrees(m.turned):.1f} deg, {m.telemetry.torque:.1f} N m"
                 return self._fail(time, m, Verdict.STUCK, detail)
@@ -417,7 +418,7 @@ class HybridRotation:
                 return self._fail(time, m, Verdict.END_STOP, detail)
             if m.stalls >= 3:
                 return self._fail(time, m, Verdict.STUCK, f"stalled {m.stalls + 1} times")
-            return dc.replace(
+            return changed(
                 m,
                 stage="back",
                 rate=0.0,
@@ -432,7 +433,7 @@ class HybridRotation:
         """Force trip, grasp lost, one hand carrying all, end of reach."""
         c = self.config
         force = np.linalg.norm(chain.f, axis=1)
-        m = dc.replace(m, tripped=m.tripped + 1 if np.max(force) > c.force_trip else 0)
+        m = changed(m, tripped=m.tripped + 1 if np.max(force) > c.force_trip else 0)
         if m.tripped >= 3:
             verdict = Verdict.STUCK if abs(chain.torque) > 0.7 * c.torque_limit else Verdict.FAULT
             return self._fail(time, m, verdict, f"hand forces {force[0]:.0f} and {force[1]:.0f} N")
@@ -440,7 +441,7 @@ class HybridRotation:
         off = np.max(np.abs(openings - self.marker.handle_width)) > 2 * c.grip_margin
         share = chain.couples[0] / chain.torque if abs(chain.torque) > 2.0 else 0.5
         bad = off or not 0.1 < share < 0.9
-        m = dc.replace(m, bad_grip_time=m.bad_grip_time + dt if bad else 0.0)
+        m = changed(m, bad_grip_time=m.bad_grip_time + dt if bad else 0.0)
         if m.bad_grip_time > 0.5:
             detail = f"{self._openings(state)}, left hand carries {100 * share:.0f} %"
             return self._fail(time, m, Verdict.SLIP, detail)
@@ -459,12 +460,12 @@ class HybridRotation:
         if m.stage == "relax":
             closed = min(state.left_gripper, state.right_gripper) < self.marker.handle_width + 2 * c.grip_margin
             if not closed or time - m.since > c.relax:
-                m = dc.replace(m, stage="open", since=time)
+                m = changed(m, stage="open", since=time)
             return m, V, grip if closed else opened
         if m.stage == "open":
             wide = min(state.left_gripper, state.right_gripper) > 0.9 * c.opening
             if wide or time - m.since > 2.0:
-                m = dc.replace(m, stage="retreat", since=time, start=m.X)
+                m = changed(m, stage="retreat", since=time, start=m.X)
             return m, V, opened
         if m.stage == "retreat":
             way = min(c.retreat, c.retreat_speed * (time - m.since))
@@ -472,13 +473,13 @@ class HybridRotation:
             m = self._command(m, (left, right))
             if way >= c.retreat:
                 status = Status(time, m.activation, "succeeded", progress=1.0, value=m.turned)
-                m = dc.replace(m, stage="away", status=status)
+                m = changed(m, stage="away", status=status)
         return m, np.zeros((2, 6)), opened
 
     # ------------------------------------------------------------ common
     def _fail(self, time: float, m: Memory, verdict: Verdict, detail: str) -> Memory:
         status = Status(time, m.activation, "failed", verdict, detail, value=m.turned)
-        return dc.replace(m, stage="failed", status=status)
+        return changed(m, stage="failed", status=status)
 
     def _move(self, dt: float, m: Memory, V: np.ndarray, chain: Chain) -> Memory:
         """Integrates the hands' twists (about the chain's centre) into commanded poses and joints."""
@@ -496,7 +497,7 @@ class HybridRotation:
             solution = self.geometry.arm_inverse(X[k], side, m.q[k])
             if solution is not None and np.max(np.abs(solution - m.q[k])) < 0.5:
                 q[k], kept[k] = solution, X[k]
-        return dc.replace(m, X=(kept[0], kept[1]), q=(q[0], q[1]))
+        return changed(m, X=(kept[0], kept[1]), q=(q[0], q[1]))
 
     def _telemetry(self, time: float, m: Memory, chain: Chain) -> TurnState:
         couples = chain.couples

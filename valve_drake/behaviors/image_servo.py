@@ -27,6 +27,7 @@ from valve_drake.behaviors.taught import TaughtReference
 from valve_drake.config import Config, number
 from valve_drake.frames import make
 from valve_drake.kinematics import RobotGeometry
+from valve_drake.memory import changed
 from valve_drake.messages import (
     LEFT,
     POSE_HISTORY,
@@ -140,12 +141,12 @@ class ImageServo:
         droop = hand.X_HG[:, 3] - p_now
         droop = droop * min(1.0, self.config.max_droop / max(float(np.linalg.norm(droop)), 1e-12))
         gone = int(bool(hand.past) and hand.past[0][0] < time - POSE_HISTORY)
-        hand = dc.replace(hand, past=(*hand.past[gone:], (time, p_now + droop)))
+        hand = changed(hand, past=(*hand.past[gone:], (time, p_now + droop)))
         if mark.found and mark.sequence != hand.seen and mark.time >= hand.past[0][0]:
             e = self.taught[side].displacement(mark.feature)
             R = hand.X_HG[:, :3]
             p_then = min(hand.past, key=lambda item: abs(item[0] - mark.time))[1]
-            hand = dc.replace(
+            hand = changed(
                 hand,
                 seen=mark.sequence,
                 seen_at=time,
@@ -154,9 +155,9 @@ class ImageServo:
                 inside=hand.inside + 1 if np.linalg.norm(e) < self.config.tolerance else 0,
             )
         elif not mark.found and mark.sequence != hand.seen:
-            hand = dc.replace(hand, seen=mark.sequence, inside=0)
+            hand = changed(hand, seen=mark.sequence, inside=0)
         if time - hand.seen_at > 0.25:  # no image for a while: stand still
-            hand = dc.replace(hand, goal=hand.X_HG[:, 3])
+            hand = changed(hand, goal=hand.X_HG[:, 3])
         step = hand.goal - hand.X_HG[:, 3]
         most = self.config.speed * dt
         length = float(np.linalg.norm(step))
@@ -165,7 +166,7 @@ class ImageServo:
         solution = self.geometry.arm_inverse(X_HG, side, hand.q)
         if solution is None or np.max(np.abs(solution - hand.q)) > 0.5:
             return hand  # out of reach, or the wrist would turn by far: keep the command
-        return dc.replace(hand, X_HG=X_HG, q=solution)
+        return changed(hand, X_HG=X_HG, q=solution)
 
     def _judge(self, time: float, activation: int, hands: dict[str, Hand]) -> Status:
         c = self.config

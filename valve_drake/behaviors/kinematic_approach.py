@@ -30,6 +30,7 @@ from valve_drake.behaviors.joint_path import Path, find_path
 from valve_drake.config import Config, number, numbers
 from valve_drake.frames import compose, inverse, planar, wrap
 from valve_drake.kinematics import ARM_LIMITS, RobotGeometry, both_arms, lateral
+from valve_drake.memory import changed
 from valve_drake.messages import (
     LEFT,
     RIGHT,
@@ -152,10 +153,10 @@ class KinematicApproach:
         m = memory
         mine_again = m.activation < 0 or (mode.activation != m.activation and m.mode in NOT_OWNED)
         if mode.activation != m.activation:
-            m = dc.replace(m, activation=mode.activation, mode=mode.mode, phase="start", since=time, looks=())
-            m = dc.replace(m, status=Status(time=time, activation=mode.activation, state="idle"))
+            m = changed(m, activation=mode.activation, mode=mode.mode, phase="start", since=time, looks=())
+            m = changed(m, status=Status(time=time, activation=mode.activation, state="idle"))
         if mine_again or mode.mode in NOT_OWNED:
-            m = dc.replace(m, q=measured, path=None)
+            m = changed(m, q=measured, path=None)
         if mode.mode in NOT_OWNED:
             return m, Command(time=time)
         run = {Mode.MEASURE: self._measure, Mode.REACH: self._reach, Mode.VERIFY: self._verify}
@@ -163,15 +164,15 @@ class KinematicApproach:
             m = run[Mode(mode.mode)](time, m, state, mode, estimate, marks, turn)
         else:
             if mode.mode == Mode.SEARCH:
-                m = dc.replace(m, stance=Stance(), stance_looks=())
+                m = changed(m, stance=Stance(), stance_looks=())
             m = self._homing(time, m, self._valve(m, state, turn))
         if m.path is not None:
-            m = dc.replace(m, q=m.path.sample(time))
+            m = changed(m, q=m.path.sample(time))
         gripper = np.array([self.config.opening, self.config.gripper_force])
         return m, Command(time=time, left_arm=m.q[:6], right_arm=m.q[6:], left_gripper=gripper, right_gripper=gripper)
 
     def _status(self, m: Memory, time: float, state: str, verdict: str = "", detail: str = "") -> Memory:
-        return dc.replace(m, status=Status(time, m.activation, state, verdict, detail))
+        return changed(m, status=Status(time, m.activation, state, verdict, detail))
 
     def _valve(self, m: Memory, state: RobotState, turn: TurnState) -> np.ndarray | None:
         """X_BV of the valve that was measured last, turned as the hands left it; None if there is none near."""
@@ -185,13 +186,13 @@ class KinematicApproach:
         if m.phase == "start":
             m = self._move(time, m, self.home, X_BV)
         if m.phase == "moving" and (m.path is None or time >= m.path.end()):
-            m = dc.replace(m, phase="home", since=time)
+            m = changed(m, phase="home", since=time)
         return m
 
     def _move(self, time: float, m: Memory, goal: np.ndarray, X_BV: np.ndarray | None) -> Memory:
         """Plans a path from the present command to `goal`; phase "moving", or "blocked" if there is none."""
         if np.max(np.abs(goal - m.q)) < 1e-6:
-            return dc.replace(m, phase="moving", path=None, since=time)
+            return changed(m, phase="moving", path=None, since=time)
         limits = np.tile(ARM_LIMITS, 2)
 
         def is_free(q: np.ndarray) -> bool:
@@ -199,9 +200,9 @@ class KinematicApproach:
 
         points = find_path(m.q, goal, self._vias(m.q, goal, X_BV), is_free)
         if points is None:
-            return dc.replace(m, phase="blocked", path=None, since=time)
+            return changed(m, phase="blocked", path=None, since=time)
         path = Path(points, time, self.config.joint_speed, self.config.joint_acceleration)
-        return dc.replace(m, phase="moving", path=path, since=time)
+        return changed(m, phase="moving", path=path, since=time)
 
     def _vias(self, q: np.ndarray, goal: np.ndarray, X_BV: np.ndarray | None) -> list[np.ndarray]:
         """Via poses: both hands drawn straight back from the end of the path at the valve; nearly always free."""
@@ -231,23 +232,23 @@ class KinematicApproach:
         if not estimate.found or estimate.sequence == m.seen:
             return m
         looks = (*m.stance_looks, estimate)[-5:]
-        m = dc.replace(m, seen=estimate.sequence, stance_looks=looks)
+        m = changed(m, seen=estimate.sequence, stance_looks=looks)
         if m.stance.found and time - m.stance_at < self.config.stance_period:
             return m
-        m = dc.replace(m, stance_at=time)
+        m = changed(m, stance_at=time)
         fused = fuse(looks)
         if not fused.found:
             return m
         base, margin = find_stance(fused.X_OV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view)
         good = margin >= self.stance.margin_min
         reason = "" if good else f"no stance holds both handles through the turn (margin {margin:.2f})"
-        return dc.replace(m, stance=Stance(time=estimate.time, found=good, base=base, margin=margin, reason=reason))
+        return changed(m, stance=Stance(time=estimate.time, found=good, base=base, margin=margin, reason=reason))
 
     # ------------------------------------------------------------ measure
     def _look(self, time: float, m: Memory, estimate: RectangleEstimate) -> Memory:
         """Gathers estimates whose images were taken after `since` + settle."""
         if estimate.found and estimate.sequence != m.seen and estimate.time >= m.since + self.config.settle:
-            m = dc.replace(m, looks=(*m.looks, estimate), seen=estimate.sequence)
+            m = changed(m, looks=(*m.looks, estimate), seen=estimate.sequence)
         return m
 
     def _measure(
@@ -261,7 +262,7 @@ class KinematicApproach:
         turn: TurnState,
     ) -> Memory:
         if m.phase == "start":
-            m = self._status(dc.replace(m, phase="look", since=time), time, "running")
+            m = self._status(changed(m, phase="look", since=time), time, "running")
         if m.phase != "look":
             return m
         m = self._look(time, m, estimate)
@@ -269,13 +270,13 @@ class KinematicApproach:
             return m
         fused = fuse(m.looks)
         if not fused.found:
-            return self._status(dc.replace(m, phase="end"), time, "failed", Verdict.MARKER_LOST, fused.reason)
+            return self._status(changed(m, phase="end"), time, "failed", Verdict.MARKER_LOST, fused.reason)
         X_BV = compose(inverse(planar(*state.odometry[:3])), fused.X_OV)
         arc = best_arc(X_BV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view)
         if arc.margin < self.stance.margin_min:
-            m = self._find_stance(time, dc.replace(m, stance_looks=m.looks, seen=-1), mode, estimate)
+            m = self._find_stance(time, changed(m, stance_looks=m.looks, seen=-1), mode, estimate)
             return self._status(
-                dc.replace(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, f"stance: arm margin {arc.margin:.2f}"
+                changed(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, f"stance: arm margin {arc.margin:.2f}"
             )
         grasps = {side: compose(X_BV, hand_in_valve(side, arc.swapped, self.marker)) for side in SIDES}
         plan = GraspPlan(
@@ -288,7 +289,7 @@ class KinematicApproach:
             X_BG_right=grasps[RIGHT],
             margin=arc.margin,
         )
-        m = dc.replace(m, phase="end", plan=plan, X_OV0=fused.X_OV)
+        m = changed(m, phase="end", plan=plan, X_OV0=fused.X_OV)
         detail = f"valve {np.linalg.norm(X_BV[:2, 3]):.3f} m ahead, {X_BV[2, 3]:.3f} m high, margin {arc.margin:.2f}"
         return self._status(m, time, "succeeded", detail=detail)
 
@@ -309,7 +310,7 @@ class KinematicApproach:
             goal = self._standoff_joints(plan)
             if goal is None:
                 return self._status(
-                    dc.replace(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, "stand-off out of reach"
+                    changed(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, "stand-off out of reach"
                 )
             m = self._move(time, m, goal, plan.X_BV)
             if m.phase == "blocked":
@@ -319,10 +320,10 @@ class KinematicApproach:
             near = all(self._mark_ratio(marks, side) >= self.config.mark_ratio for side in SIDES)
             if arrived or near:
                 why = "at the stand-off" if arrived else "marks are large enough"
-                m = dc.replace(m, phase="rest", since=time, path=m.path if arrived else None)
+                m = changed(m, phase="rest", since=time, path=m.path if arrived else None)
                 m = self._status(m, time, "running", detail=why)
         if m.phase == "rest" and time >= m.since + self.config.rest:
-            m = self._status(dc.replace(m, phase="end"), time, "succeeded", detail=m.status.detail)
+            m = self._status(changed(m, phase="end"), time, "succeeded", detail=m.status.detail)
         return m
 
     def _mark_ratio(self, marks: HandleMarks, side: str) -> float:
@@ -358,17 +359,17 @@ class KinematicApproach:
             if m.phase == "blocked":
                 return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path home")
         if m.phase == "home":
-            m = dc.replace(m, phase="look", since=time)
+            m = changed(m, phase="look", since=time)
         if m.phase != "look":
             return m
         m = self._look(time, m, estimate)
         newest = m.looks[-1].time if m.looks else 0.0
-        m = dc.replace(m, looks=tuple(look for look in m.looks if look.time >= newest - self.config.still_time))
+        m = changed(m, looks=tuple(look for look in m.looks if look.time >= newest - self.config.still_time))
         drift = self._drift(m.looks)
         if drift is None or abs(drift) > self.config.still_rate:
             return self._unverified(m, time, mode, turn, drift) if time - m.since > self.config.look_time else m
         fused = fuse(m.looks)
-        m = dc.replace(m, phase="end")
+        m = changed(m, phase="end")
         if not fused.found or m.X_OV0 is None:
             return self._status(m, time, "failed", Verdict.MARKER_LOST, fused.reason)
         seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, turn.angle)
@@ -376,7 +377,7 @@ class KinematicApproach:
         detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(mode.turn_angle):.2f} deg"
         state_now = "succeeded" if missing <= self.config.angle_tolerance else "failed"
         verdict = Verdict.NONE if state_now == "succeeded" else Verdict.SLIP
-        return dc.replace(m, status=Status(time, m.activation, state_now, verdict, detail, 1.0, seen))
+        return changed(m, status=Status(time, m.activation, state_now, verdict, detail, 1.0, seen))
 
     def _drift(self, looks: tuple[RectangleEstimate, ...]) -> float | None:
         """How fast the valve turns, by the slope of its angle over the looks [rad/s]; None: too few of them to tell.
@@ -398,14 +399,14 @@ class KinematicApproach:
         """The camera cannot say how far the valve is turned: what the hands felt is told, and not taken for it."""
         asked, felt = np.degrees(mode.turn_angle), np.degrees(turn.angle)
         hands = f"hands turned {felt:.2f} deg of {asked:.2f} deg"
-        m = dc.replace(m, phase="end")
+        m = changed(m, phase="end")
         if drift is None or m.X_OV0 is None:
             return self._status(m, time, "failed", Verdict.UNVERIFIED, f"camera does not see the marker, {hands}")
         fused = fuse(m.looks[-1:])
         seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, turn.angle)
         camera = f"camera sees {np.degrees(seen):.2f} deg, turning by {np.degrees(drift):+.2f} deg/s"
         status = Status(time, m.activation, "failed", Verdict.UNVERIFIED, f"{camera}, {hands}", 1.0, seen)
-        return dc.replace(m, status=status)
+        return changed(m, status=status)
 
     def seen_angle(self, X_OV0: np.ndarray, X_OV1: np.ndarray, axis_known: bool, by_hands: float) -> float:
         """The turned angle by camera [rad]. The rectangle repeats every quarter turn, with the green marks every half:

@@ -22,6 +22,7 @@ import numpy as np
 from valve_drake.checks import require
 from valve_drake.config import Config, number, numbers
 from valve_drake.frames import apply, wrap
+from valve_drake.memory import changed
 from valve_drake.messages import (
     Command,
     Mode,
@@ -152,7 +153,7 @@ def step(
     if not m.started:
         if len(robot_state.history) == 0:  # nothing was measured yet
             return m, Command(time=time), Status(time=time, activation=mode.activation)
-        m = dc.replace(m, started=True, torso=robot_state.torso, goal=robot_state.torso, velocity=np.zeros(3))
+        m = changed(m, started=True, torso=robot_state.torso, goal=robot_state.torso, velocity=np.zeros(3))
     if mode.activation != m.activation:
         m = _begin(m, time, mode, base)
 
@@ -169,7 +170,7 @@ def step(
         goal = _gaze(config, m, base, robot_state.torso[0], mode.mode in DRIVING, head_pose)
     speed = np.array([config.waist_speed, config.neck_speed, config.neck_speed])
     torso, velocity = follow(goal, (goal - m.goal) / dt, m.torso, m.velocity, speed, config.acceleration, dt)
-    m = dc.replace(m, torso=torso, velocity=velocity, goal=goal)
+    m = changed(m, torso=torso, velocity=velocity, goal=goal)
     return m, Command(time=time, torso=torso, base_twist=twist), _status(config, m, time, mode)
 
 
@@ -195,7 +196,7 @@ def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
 
 
 def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") -> Memory:
-    return dc.replace(m, result=result, verdict=str(verdict), detail=detail)
+    return changed(m, result=result, verdict=str(verdict), detail=detail)
 
 
 def _status(config: ValveSearchConfig, m: Memory, time: float, mode: ModeState) -> Status:
@@ -220,14 +221,14 @@ def _sight(config: ValveSearchConfig, m: Memory, position: StereoPosition, estim
         return m
     if time <= m.capture_time:
         return m
-    m = dc.replace(m, capture_time=time)
+    m = changed(m, capture_time=time)
     p_OV = apply(X_OL, p_LV)
     if not np.all(np.isfinite(p_OV)):  # it would stay in the memory
         return m
     far = m.target is not None and np.linalg.norm(p_OV - m.target) > config.jump
     if far and time - m.target_time < config.jump_after:
         return m
-    return dc.replace(m, target=p_OV, target_time=time)
+    return changed(m, target=p_OV, target_time=time)
 
 
 def _gaze(
@@ -265,14 +266,14 @@ def _search(
 ) -> tuple[Memory, np.ndarray]:
     """One tick of the search -> memory, torso goal."""
     turned = wrap(float(base[2]) - m.heading)
-    m = dc.replace(m, heading=float(base[2]), to_turn=m.to_turn - turned if m.to_turn else 0.0)
+    m = changed(m, heading=float(base[2]), to_turn=m.to_turn - turned if m.to_turn else 0.0)
     if m.result == "running":
         m = _look(config, m, time, position)
     confirming = bool(m.looks) and (time < m.confirm_until or m.confirm_left > 0)
     if m.looks and not confirming and m.result == "running":
-        m = dc.replace(m, looks=(), ignore_until=time + config.skip_time)
+        m = changed(m, looks=(), ignore_until=time + config.skip_time)
     if confirming or m.result != "running":
-        m = dc.replace(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt))
+        m = changed(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt))
         if not m.looks:
             return m, m.goal
         neck = aim(head_pose, base, m.goal, m.looks[-1][0])
@@ -285,7 +286,7 @@ def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPos
     if position.time > m.seen_time:
         axis = position.X_OL[:, 2]
         azimuth, left = float(np.arctan2(axis[1], axis[0])), max(m.confirm_left - 1, 0)
-        m = dc.replace(m, seen_time=position.time, seen_azimuth=azimuth, confirm_left=left)
+        m = changed(m, seen_time=position.time, seen_azimuth=azimuth, confirm_left=left)
     if not position.found or position.time <= max(m.capture_time, m.since, m.ignore_until):
         return m
     p_OV = apply(position.X_OL, position.p_LV)
@@ -294,13 +295,13 @@ def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPos
     sigma = float(np.sqrt(np.trace(position.covariance)))
     looks = (*m.looks, (p_OV, sigma))[-config.sightings :]
     if not m.looks:
-        m = dc.replace(m, confirm_until=time + config.confirm_time, confirm_left=config.confirm_looks)
-    m = dc.replace(m, looks=looks, capture_time=position.time)
+        m = changed(m, confirm_until=time + config.confirm_time, confirm_left=config.confirm_looks)
+    m = changed(m, looks=looks, capture_time=position.time)
     if not agree(config, looks, position.X_OL[:, 3]):
         return m
     p_OV = np.mean([p for p, _ in looks], axis=0)
     distance = float(np.hypot(*(p_OV - position.X_OL[:, 3])[:2]))
-    m = dc.replace(m, target=p_OV, target_time=position.time)
+    m = changed(m, target=p_OV, target_time=position.time)
     return _end(m, "succeeded", detail=f"marker {distance:.2f} m away, {p_OV[2]:.2f} m high")
 
 
@@ -311,17 +312,17 @@ def _sweep(config: ValveSearchConfig, m: Memory, dt: float, heading: float) -> t
     goal = _sweep_torso(config, m.gaze, pitch)
     if abs(m.to_turn) > 0.05:
         rate = towards(m.to_turn, config.turn_speed, config.turn_acceleration, dt)
-        return dc.replace(m, turn_rate=slew(m.turn_rate, rate, config.turn_acceleration * dt)), goal
-    m = dc.replace(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt), to_turn=0.0)
+        return changed(m, turn_rate=slew(m.turn_rate, rate, config.turn_acceleration * dt)), goal
+    m = changed(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt), to_turn=0.0)
     if np.max(np.abs(goal - m.torso)[1:]) > 0.1:  # the neck is still on its way, after a look aside or a new pitch
         return m, goal
     if m.side * wrap(heading + m.gaze - m.seen_azimuth) > config.ahead:  # or a slow camera would miss what is passed
         return m, goal
     gaze = slew(m.gaze, m.side * end, config.sweep_speed * dt)
-    m = dc.replace(m, gaze=float(gaze))
+    m = changed(m, gaze=float(gaze))
     if gaze == m.side * end:
         sweeps = m.sweeps + 1
-        m = dc.replace(m, sweeps=sweeps, side=-m.side, to_turn=m.side * np.pi if sweeps % 2 == 1 else 0.0)
+        m = changed(m, sweeps=sweeps, side=-m.side, to_turn=m.side * np.pi if sweeps % 2 == 1 else 0.0)
         if sweeps == 2 * len(config.pitches):
             m = _end(m, "failed", Verdict.NOT_FOUND, f"no marker in {sweeps} sweeps all round")
             return m, goal

@@ -11,6 +11,7 @@ The first command of each joint is its measured position.
 """
 
 import dataclasses as dc
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -18,8 +19,9 @@ import numpy as np
 from valve_drake.checks import ConfigError, require
 from valve_drake.config import Config, number, numbers
 from valve_drake.kinematics import ARM_LIMITS
+from valve_drake.memory import changed
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, Health, Mode, ModeState, RobotState, SelectorReport
-from valve_drake.motion import follow, slew
+from valve_drake.motion import follow
 
 BEHAVIORS = ("valve_search", "base_approach", "kinematic_approach", "image_servo", "hybrid_rotation")
 HOLD, OPEN = "hold", "command_selector"  # nobody commands this group; the selector itself opens the hand
@@ -194,7 +196,7 @@ def step(
         if len(robot_state.history) == 0 or not np.all(np.isfinite(measured(robot_state))):
             return m, SelectorReport(time=time, source=(HOLD,) * len(GROUPS), refused=("robot_state: none yet",))
         position = measured(robot_state)
-        m = dc.replace(m, position=position, target=position, started=True)
+        m = changed(m, position=position, target=position, started=True)
 
     source, refused = _sources(config, time, mode, robot_state, health)
     wanted: dict[str, np.ndarray] = {}
@@ -213,12 +215,12 @@ def step(
         else:
             wanted[group] = value
 
-    twist, changed = _base(m, wanted.get("base"), dt)
-    position, velocity, target, joints_changed = _joints(m, wanted, dt)
-    force, force_changed = _force(config, m, wanted)
+    twist, base_limited = _base(m, wanted.get("base"), dt)
+    position, velocity, target, joints_limited = _joints(m, wanted, dt)
+    force, force_limited = _force(config, m, wanted)
     over, tripped = _trip(config, m, mode, robot_state)
     behind, astray = _follow(config, m, robot_state, dt)
-    memory = dc.replace(
+    memory = changed(
         m,
         position=position,
         velocity=velocity,
@@ -233,7 +235,7 @@ def step(
     report = SelectorReport(
         time=time,
         source=tuple(source[group] for group in GROUPS),
-        limited=(*changed, *joints_changed, *force_changed),
+        limited=(*base_limited, *joints_limited, *force_limited),
         refused=tuple(refused),
         tripped=tripped,
         astray=astray,
@@ -260,6 +262,8 @@ def _sources(
         return dict.fromkeys(GROUPS, HOLD), late
     if health.estop:
         return {g: s if g in GRIPPERS else HOLD for g, s in source.items()}, ["emergency stop"]
+    if (health.ages <= config.max_age).all():
+        return source, []
     silent = {device: age for device, age in zip(health.devices, health.ages) if not age <= config.max_age}
     problems = []
     for group in source:
@@ -281,7 +285,7 @@ def _asked(
     value = getattr(command, "base_twist" if group == "base" else group)
     if value is None:
         return None, ""
-    if not np.isfinite(value).all():
+    if not all(map(math.isfinite, value.tolist())):  # of so few numbers a fifth of numpy's time
         return None, "not finite"
     if group in GRIPPERS and value[1] < 0:
         return None, f"force limit {value[1]:.1f} N"
@@ -289,15 +293,21 @@ def _asked(
 
 
 def _base(m: Memory, wanted: np.ndarray | None, dt: float) -> tuple[np.ndarray, list[str]]:
-    goal = np.zeros(2) if wanted is None else wanted
-    allowed = np.clip(goal, -m.bounds.base_speed, m.bounds.base_speed)
-    twist = slew(m.twist, allowed, m.bounds.base_acceleration * dt)
-    changed = []
-    if np.any(allowed != goal):
-        changed.append("base.velocity")
-    if np.any(np.abs(twist - allowed) > 1e-12):
-        changed.append("base.acceleration")
-    return np.where(np.abs(twist - allowed) > 1e-12, twist, allowed), changed
+    goal = (0.0, 0.0) if wanted is None else wanted.tolist()
+    twist, limits = [], set()
+    limited = zip(goal, m.twist.tolist(), m.bounds.base_speed.tolist(), m.bounds.base_acceleration.tolist())
+    for asked, now, speed, acceleration in limited:
+        allowed = min(max(asked, -speed), speed)
+        step = acceleration * dt
+        reached = now + min(max(allowed - now, -step), step)
+        if allowed != asked:
+            limits.add("velocity")
+        if abs(reached - allowed) > 1e-12:
+            limits.add("acceleration")
+        else:
+            reached = allowed
+        twist.append(reached)
+    return np.array(twist), [f"base.{limit}" for limit in ("velocity", "acceleration") if limit in limits]
 
 
 def _joints(
@@ -309,35 +319,37 @@ def _joints(
         if group in wanted:
             asked[part] = wanted[group][:1] if group in GRIPPERS else wanted[group]
             held[part] = False
-    target = np.clip(asked, b.low, b.high)
+    target = np.minimum(np.maximum(asked, b.low), b.high)
     position, velocity = follow(target, (target - m.target) / dt, m.position, m.velocity, b.speed, b.acceleration, dt)
-    # A held joint has no target: it brakes.
-    braked = np.sign(m.velocity) * np.maximum(np.abs(m.velocity) - b.acceleration * dt, 0.0)
-    # A joint that was measured outside its limits stays where it is until a command brings it back.
-    stay = np.clip(m.position + braked * dt, np.minimum(b.low, m.position), np.maximum(b.high, m.position))
-    position = np.where(held, stay, position)
-    velocity = np.where(held, (stay - m.position) / dt, velocity)
-    changed: list[str] = []
+    if held.any():
+        # A held joint has no target: it brakes.
+        braked = np.sign(m.velocity) * np.maximum(np.abs(m.velocity) - b.acceleration * dt, 0.0)
+        # A joint that was measured outside its limits stays where it is until a command brings it back.
+        low, high = np.minimum(b.low, m.position), np.maximum(b.high, m.position)
+        stay = np.minimum(np.maximum(m.position + braked * dt, low), high)
+        position = np.where(held, stay, position)
+        velocity = np.where(held, (stay - m.position) / dt, velocity)
+    limited: list[str] = []
     if (asked == target).all() and (position == target).all():  # nearly every tick
-        return position, velocity, target, changed
+        return position, velocity, target, limited
     for group in wanted:
         if group not in JOINTS:
             continue
         part = JOINTS[group]
         if np.any(asked[part] != target[part]):
-            changed.append(f"{group}.position")
+            limited.append(f"{group}.position")
         short = position[part] != target[part]
         if np.any(short):
             at_speed = np.abs(velocity[part]) >= b.speed[part] * (1 - 1e-9)
-            changed += [f"{group}.velocity"] if np.any(short & at_speed) else []
-            changed += [f"{group}.acceleration"] if np.any(short & ~at_speed) else []
-    return position, velocity, target, changed
+            limited += [f"{group}.velocity"] if np.any(short & at_speed) else []
+            limited += [f"{group}.acceleration"] if np.any(short & ~at_speed) else []
+    return position, velocity, target, limited
 
 
 def _force(config: CommandSelectorConfig, m: Memory, wanted: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    asked = np.array([wanted[g][1] if g in wanted else m.force[k] for k, g in enumerate(GRIPPERS)])
-    force = np.minimum(asked, config.gripper_force)
-    return force, [f"{g}.force" for k, g in enumerate(GRIPPERS) if force[k] != asked[k]]
+    asked = [float(wanted[g][1] if g in wanted else m.force[k]) for k, g in enumerate(GRIPPERS)]
+    force = [min(limit, config.gripper_force) for limit in asked]
+    return np.array(force), [f"{g}.force" for g, want, limit in zip(GRIPPERS, asked, force) if limit != want]
 
 
 def _trip(
@@ -347,7 +359,7 @@ def _trip(
     kept = m.tripped if mode.activation == m.activation else ()
     over = []
     for count, wrench in zip(m.over, (state.left_wrench, state.right_wrench)):
-        safe = np.linalg.norm(wrench[3:]) <= config.trip_force  # False for NaN
+        safe = math.hypot(*wrench[3:].tolist()) <= config.trip_force  # False for NaN
         over.append(0 if safe else count + 1)
     now = [side for side, count in zip(SIDES, over) if count >= config.trip_ticks]
     return (over[0], over[1]), tuple(side for side in (LEFT, RIGHT) if side in kept or side in now)
@@ -357,8 +369,8 @@ def _follow(
     config: CommandSelectorConfig, m: Memory, state: RobotState, dt: float
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Counts ticks for which each group is behind its last command; written so that NaN is behind."""
-    off = np.abs(measured(state) - m.position)
-    near = {group: np.all(off[JOINTS[group]] <= config.follow_error) for group in FOLLOWERS if group != "base"}
-    near["base"] = np.all(np.abs(state.odometry[3:] - m.twist) <= config.follow_speed)
+    close = np.abs(measured(state) - m.position) <= config.follow_error
+    near = {group: close[JOINTS[group]].all() for group in FOLLOWERS if group != "base"}
+    near["base"] = (np.abs(state.odometry[3:] - m.twist) <= config.follow_speed).all()
     behind = tuple(0 if near[group] else count + 1 for group, count in zip(FOLLOWERS, m.behind))
     return behind, tuple(group for group, count in zip(FOLLOWERS, behind) if count * dt > config.follow_time)

@@ -65,7 +65,7 @@ class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
     def _hold_initial(self, context: Context, state: State) -> None:
         # The plant reads the ports before the first step; a simulator that is initialised again changes nothing.
         for port, value in outputs(self.memory(context)).items():
-            state.get_mutable_discrete_state(int(self._held[port])).SetFromVector(value)
+            state.get_mutable_discrete_state(self._held[port]).SetFromVector(value)
 
     def step(self, time: float, inputs: CommandSelectorInputs, memory: Memory) -> tuple[Memory, Outputs]:
         commands = {name: inputs[name] for name in BEHAVIORS}

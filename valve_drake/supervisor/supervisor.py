@@ -28,6 +28,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from valve_drake.config import Config, number, table
+from valve_drake.memory import changed
 from valve_drake.messages import (
     CAMERAS,
     DEVICES,
@@ -157,7 +158,7 @@ def step(
     request = ""
     if operator is not None and operator.sequence != s.sequence:
         request = operator.command
-        s = dc.replace(s, sequence=operator.sequence)
+        s = changed(s, sequence=operator.sequence)
     if s.mode in TERMINAL:
         return _reset(s, time) if request == "reset" else s
     if request == "stop" and not _aborting(s):
@@ -217,7 +218,7 @@ def find_fault(config: SupervisorConfig, time: float, health: Health | None, sel
 
 def _enter(s: State, time: float, mode: Mode, reason: str, **changes: Any) -> State:
     """A new activation."""
-    return dc.replace(
+    return changed(
         s, mode=mode, activation=s.activation + 1, since=time, reason=reason, entered=(*s.entered, mode), **changes
     )
 
@@ -230,7 +231,7 @@ def _begin(config: SupervisorConfig, s: State, time: float, request: str, angle:
     if request not in ("open", "close"):
         return s
     if not 0 < angle <= config.angle_limit:
-        return dc.replace(s, reason=f"refused: angle must be within (0, {config.angle_limit:g}] rad, got {angle}")
+        return changed(s, reason=f"refused: angle must be within (0, {config.angle_limit:g}] rad, got {angle}")
     if fault:
         return _enter(s, time, Mode.FAILED, fault, verdict=Verdict.FAULT)
     sign = 1.0 if request == "open" else -1.0
@@ -244,7 +245,7 @@ def _aborting(s: State) -> bool:
 def _abort(s: State, time: float, end: Mode, verdict: Verdict, reason: str) -> State:
     """Fault or stop: hands off the valve first, everything else stands still at once."""
     if s.mode == Mode.RELEASE:  # it goes on, but nothing comes after it
-        return dc.replace(s, after_release=end, verdict=verdict, reason=reason)
+        return changed(s, after_release=end, verdict=verdict, reason=reason)
     if s.mode in CONTACT:
         return _enter(s, time, Mode.RELEASE, reason, verdict=verdict, after_release=end)
     return _enter(s, time, end, reason, verdict=verdict)
