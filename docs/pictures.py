@@ -1,7 +1,8 @@
-"""Makes the pictures of the documents from the log of a run: python docs/pictures.py logs/run-1.mcap docs"""
+"""Makes the pictures of docs/ from the log of a run: python docs/pictures.py logs/run-1.mcap docs"""
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,9 +26,9 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def positions(rig: CameraRig, reader: LogReader, bar_angle: float, time: float) -> np.ndarray:
-    """The scene's joint positions as the log has them at `time`."""
+    """The plant's positions (n,) that the log has at `time` [s]."""
 
-    def at(topic: str):
+    def at(topic: str) -> Any:
         return next(m for _, _, m in reader.messages([topic], start=time))
 
     states = {j.name: j.position for j in at("/joint_states").joints}
