@@ -1,4 +1,4 @@
-"""Messages that a driver's author, or somebody else on the network, may send by mistake or on purpose."""
+"""Malformed LCM messages, as a faulty driver or somebody else on the network may send them."""
 
 import math
 import struct
@@ -52,7 +52,7 @@ def wild_image(rng):
 
 
 def wild_values(row, rng):
-    """The right type and count, with numbers that are none and any stamp."""
+    """The right type and count, with NaN, infinite or absurd numbers and any stamp."""
     ports = {port: rng.choice(WILD, size) for port, size in SIZES.items()}
     return row.encode(int(rng.choice(STAMPS)), ports)
 

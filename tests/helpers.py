@@ -83,7 +83,7 @@ def assert_holds_between_updates(rig: Rig, port: str, slot: int, period: float =
 
 
 def assert_clones_are_independent(make, change: dict[str, Any], outputs: tuple[str, ...]) -> None:
-    """make() -> Rig. A clone with other inputs goes its own way, and the original repeats itself bit by bit."""
+    """make() -> Rig. A clone with other inputs does not affect the original, which repeats bit by bit."""
     rig = make().run(0.1)
     clone = rig.context.Clone()
     other = Simulator(rig.block, clone)

@@ -1,4 +1,4 @@
-"""MCAP files as other programs write them, and as none should: made record by record."""
+"""MCAP files as other programs write them, and invalid ones: made record by record."""
 
 import dataclasses as dc
 import struct

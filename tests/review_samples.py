@@ -60,7 +60,7 @@ def valve_angle(t):
 
 
 def base(t):
-    """The base turns at 1 rad/s for the first second, the neck against it: an error of a tick in time would show."""
+    """The base turns at 1 rad/s for the first second, the neck against it: an error of one tick in time shows."""
     return np.array([0.1, 0.2, 3.0 + min(t, 1.0)])
 
 

@@ -1,4 +1,4 @@
-"""The robot as the tests know it, from the package: what is wrong there is wrong in no second place."""
+"""Facts of the robot for the tests, taken from the package, so that no test has a copy of its own."""
 
 import numpy as np
 

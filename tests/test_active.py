@@ -1,4 +1,4 @@
-"""The log that is being written belongs to one process, and nothing that exists is written over."""
+"""active: a log under way belongs to one process, and existing files are never overwritten."""
 
 import os
 import subprocess

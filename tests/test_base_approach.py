@@ -264,7 +264,7 @@ def test_fine_approach_brakes_for_a_stance_at_the_very_edge_of_the_forbidden_zon
 
 @pytest.mark.parametrize("depth", [0.05, MARKER.panel_depth, 0.30])
 def test_fine_approach_refuses_a_stance_within_the_clearance(depth):
-    """By 5 cm: with a short stem the panel is nearer than with the usual one, and the stance with it."""
+    """A stance 5 cm too near to the panel. With a short stem panel and stance are nearer to the marker."""
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0, depth=depth)
     run = drive(
         Mode.FINE_APPROACH,
@@ -497,7 +497,7 @@ def test_block_refuses_a_wrong_message_and_needs_the_robot_state():
 
 @pytest.mark.parametrize("scale, ends", [(0.5, "fault"), (0.75, ""), (1.0, ""), (1.3, ""), (2.0, "fault")])
 def test_odometry_that_counts_half_or_double_is_a_fault_in_rough_approach(scale, ends):
-    """The cameras see the marker come nearer by another length than the wheels count."""
+    """The distance to the marker by the cameras shrinks by another length than the wheels report."""
     rng = np.random.default_rng(3)
     scene = Scene(np.array([6.0, 0.0, 0.0]), rng)
     wheels = Wheels(np.zeros(3))

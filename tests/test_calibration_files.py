@@ -1,4 +1,4 @@
-"""Camera files of other programs: one camera is one lens in every kind of file; what is not understood is refused."""
+"""Camera files of other programs: one camera gives the same lens from every kind of file; unknown keys are refused."""
 
 import copy
 import pathlib

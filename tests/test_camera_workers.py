@@ -1,4 +1,4 @@
-"""camera_workers: the same images as the rig's, made in other processes and begun ahead."""
+"""camera_workers: makes the same images as CameraRig in other processes, and begins them early."""
 
 import gc
 import os

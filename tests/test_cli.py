@@ -24,7 +24,7 @@ def send(number=signal.SIGTERM):
 
 @pytest.fixture
 def patient(monkeypatch):
-    """No signal is taken for the echo of the one before."""
+    """Disables the time within which a second signal counts as the same one."""
     monkeypatch.setattr(common, "ECHO", 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Foreign text on the terminal: nothing of a log, a file or an argument is obeyed."""
+"""Foreign text on the terminal: control sequences in logs, files and arguments are escaped."""
 
 import io
 

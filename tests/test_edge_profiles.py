@@ -1,4 +1,4 @@
-"""What the fits need of the profiles' pixels, against the pixels themselves."""
+"""edge_profiles: the weighted products of profiles that the fits use, against the pixels themselves."""
 
 import math
 

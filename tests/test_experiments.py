@@ -125,7 +125,7 @@ def test_refined_is_steadier_than_stereo_vision_in_tables_3_and_4():
 
 
 def test_refined_is_near_the_bound_and_its_covariance_honest():
-    """Far away, where the corners are a good part of what is seen."""
+    """At a large distance, where the corners' pixels are a large part of the information."""
     result = mut.bound(trials=20, distances=(2.5,), tilts=(30,))
     for cameras in ("one", "two"):
         total = result["totals"][cameras]
@@ -136,7 +136,7 @@ def test_refined_is_near_the_bound_and_its_covariance_honest():
 
 
 def test_information_is_that_of_the_image():
-    """Of all pixels there is more than of those off the corners, and half the noise is four times the information."""
+    """All pixels hold more information than those off the corners; half the noise gives four times the information."""
     F = mut.information(pose(), HEAD, MARKER, 2.0)
     assert (np.linalg.eigvalsh(F[:, 0] - F[:, 1]) > -1e-6 * np.abs(F[:, 0]).max()).all()
     ratio = mut.information(pose(), HEAD, MARKER, 4.0) / F

@@ -171,7 +171,7 @@ def test_the_arc_says_where_it_starts_and_that_the_whole_of_it_is_reached():
 
 
 def test_handles_are_shared_the_better_way():
-    """A valve that is half a turn on looks the same, with its ends exchanged: the hands do not cross for it."""
+    """A valve turned by half a turn looks the same with its ends exchanged: the hands must not cross."""
     X_BV = compose(inverse(planar(1.2, 0.4, 0.3)), valve_at(1.0))
     straight = best_arc(X_BV, np.pi / 2, GEOMETRY, MARKER, CONFIG, VIEW)
     other = best_arc(turned(X_BV, np.pi), np.pi / 2, GEOMETRY, MARKER, CONFIG, VIEW)

@@ -43,7 +43,7 @@ def board_seen(X_BE: np.ndarray, sigma: float = 0.0, rng: np.random.Generator | 
 
 
 def scattered(poses: list[np.ndarray], deg: float, mm: float, rng: np.random.Generator) -> list[np.ndarray]:
-    """The arm is not where it says it is."""
+    """The poses with random rotation and position errors, about and along each axis."""
     turns = rng.normal(0, np.radians(deg), (len(poses), 3))
     shifts = rng.normal(0, mm / 1e3, (len(poses), 3))
     return [frames.make(X[:, :3] @ frames.rotation(w), X[:, 3] + p) for X, w, p in zip(poses, turns, shifts)]
@@ -152,7 +152,7 @@ def test_a_hand_that_turned_about_one_axis_is_refused():
 
 @pytest.fixture
 def command(tmp_path, monkeypatch, capsys):
-    """Runs `calibrate hand-eye` on the corners of twelve images that nobody draws -> code, numbers, errors."""
+    """Runs `calibrate hand-eye` on corners given in place of twelve images -> exit code, JSON, standard error."""
     rng, true = np.random.default_rng(8), hand_poses(12)
     corners = [board_seen(X, 0.2, rng) for X in true]
     given = scattered(true, 0.1, 1.0, rng)

@@ -24,7 +24,7 @@ TEXT, BINARY = 1, 2
 
 
 class Client:
-    """The little of RFC 6455 and of Foxglove's protocol that a subscriber needs."""
+    """The parts of RFC 6455 (WebSocket) and of Foxglove's protocol that a subscriber needs."""
 
     def __init__(self, port):
         self._socket = socket.create_connection(("127.0.0.1", port), timeout=5)

@@ -1,4 +1,4 @@
-"""From a made-up run whose truth is known to its numbers."""
+"""Metrics of a made-up run, against its known truth."""
 
 import dataclasses as dc
 

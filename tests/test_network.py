@@ -65,7 +65,7 @@ ASK = "from valve_drake.stations.network import check_route; check_route('udpm:/
 
 
 def in_space(shell: str, code: str) -> str:
-    """Runs Python in a network of its own -> the last line of what it complains about, or ""."""
+    """Runs Python in a network namespace -> the last line of standard error, or ""."""
     script = shell + '\nexec "$0" -c "$1"'
     done = subprocess.run([*SPACE[:2], "sh", "-ec", script, sys.executable, code], capture_output=True, text=True)
     return (done.stderr.strip().splitlines() or [""])[-1] + done.stdout

@@ -1,4 +1,4 @@
-"""The tag that other detectors are shown is exact, its bound and their covariance are right."""
+"""The drawn tag for other detectors is exact, and its bound and their covariance are right."""
 
 import cv2
 import numpy as np

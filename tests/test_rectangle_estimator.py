@@ -237,7 +237,7 @@ def test_two_nodes_on_each_side_say_what_all_points_say():
 
 
 def test_refined_ends_in_a_minimum_whichever_tilt_the_track_prefers():
-    """Seen frontally by one eye there may be no second minimum, and the track may prefer the side that has none."""
+    """In a frontal view by one camera a second minimum may not exist, and the track may prefer the side without one."""
     rng, marker = np.random.default_rng(3), MARKER.corners()
     for _ in range(20):
         X = facing(1.2, *rng.uniform(-0.02, 0.02, 2), rng.uniform(-0.5, 0.5))
@@ -281,7 +281,7 @@ def test_cameras_that_are_not_as_calibrated_make_the_covariance_larger():
 
 
 def off_the_epipolar_line(edges: MarkerEdges, px: float) -> MarkerEdges:
-    """The right image's points `px` lower."""
+    """The right image's points, moved down by `px`."""
     down = np.array([0.0, px / HEAD.right.focal()])
     right = dc.replace(edges.right, points=edges.right.points + down, corners=edges.right.corners + down)
     return dc.replace(edges, right=right)
@@ -307,7 +307,7 @@ def test_a_right_image_that_lies_lower_is_within_the_covariance_or_refused_with_
 
 
 def test_an_oblique_marker_near_converging_cameras_is_on_its_epipolar_line():
-    """The mean of the corners is not the image of one point: here it is 2 px off."""
+    """The mean of the corners is not the image of the centre: here it is 2 px off."""
     X = facing(0.3, 0.1, 0.75, 0.6)
     eyes = dc.replace(HEAD, X_LR=frames.make(frames.rot_y(-0.36), HEAD.X_LR[:, 3]))
     for k in range(4):
@@ -337,7 +337,7 @@ def test_edges_that_determine_no_pose_are_refused():
 
 @pytest.mark.parametrize("change", ["yaw", "roll", "wider", "other size"])
 def test_a_contradiction_between_the_cameras_is_within_the_covariance(change):
-    """Either the head is not as calibrated or the marker is of another size: the pose is off by what either makes."""
+    """The head may be off its calibration or the marker of another size: the covariance must hold either error."""
     R, scale = np.eye(3), 1.0
     if change in ("yaw", "roll"):
         R = frames.rotation(np.radians(0.2) * np.array([0, 1, 0] if change == "yaw" else [0, 0, 1]))
@@ -376,7 +376,7 @@ def test_two_tilts_that_nothing_decides_between_are_both_within_the_covariance()
 
 
 def test_covariance_is_honest_where_the_tilt_folds():
-    """Seen frontally by one eye, a marker's tilt shows by its square: noise makes it seem tilted, and known for it."""
+    """In a frontal view by one camera the image depends on the tilt's square: noise makes the marker seem tilted."""
     X, rng = facing(2.5, 0.0, 0.0, 0.3), np.random.default_rng(4)
     values = []
     for _ in range(150):

@@ -1,4 +1,4 @@
-"""Filled-in messages: what a parser reads of them is what was filled in, to the bit."""
+"""Filled-in templates: a parser reads the values that were filled in, to the bit."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""reports: stamps, bad messages, second senders, placed clocks and the count of lock-step."""
+"""reports: stamps, bad messages, second senders, clock alignment and lock-step's count of messages."""
 
 import math
 
@@ -13,7 +13,7 @@ DAY = 86_400_000_000  # [us]
 
 
 def judged(sent, quiet=0.0):
-    """sent: (stamp [s], time [s]) -> the verdicts."""
+    """sent: (stamp [s], time [s]) of each report -> the verdict on it (NEWS, OLD, ...)."""
     stamps = Stamps(quiet)
     return [stamps.judge("a", round(1e6 * stamp), time) for stamp, time in sent]
 

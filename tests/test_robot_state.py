@@ -11,7 +11,7 @@ from valve_drake.stations.contract import CONTRACT
 
 
 def values() -> dict[str, np.ndarray]:
-    """Every measured number of the station different from every other."""
+    """Station outputs in which every number differs from every other."""
     out, start = {}, 0.0
     for name, size in RobotStateSystem.INPUTS.items():
         out[name] = start + np.arange(size)

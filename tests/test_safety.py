@@ -85,7 +85,7 @@ class Seen:
 
 
 class Rehearsal:
-    """Program and twin in one process, without a log, that can go back to where they were."""
+    """Program and twin in one process, without a log; `Rehearsal` can return to a snapshot."""
 
     def __init__(self, scenario):
         self._beside = rehearsal.beside(scenario)
@@ -146,7 +146,7 @@ class Rehearsal:
         self.twin.faults = self.twin._in._faults = self.twin._out._faults = Faults(faults, seed=1)
 
     def suffer(self, fault, longest=4.0):
-        """A fault now -> what comes of it, until a second after the run's end, or for `longest` seconds."""
+        """Starts a fault -> what the robot did until a second after the run's end, or for `longest` seconds."""
         begin, mode = self.twin.time, self.mode
         self.faults([dc.replace(fault, start=begin)])
         seen = Seen()
@@ -165,7 +165,7 @@ class Rehearsal:
 
 @pytest.fixture(scope="module")
 def at_modes():
-    """A run up to its end, and where it was at a random time in every mode."""
+    """A run to its end, and snapshots of it at a random time in every mode."""
     robot = Rehearsal(near())
     rng, saved, wait = np.random.default_rng(7), {}, None
     while robot.mode.mode not in TERMINAL:

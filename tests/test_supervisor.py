@@ -489,7 +489,7 @@ def test_the_deadline_of_turn_grows_with_the_angle():
 
 
 def test_a_run_that_loses_its_way_within_all_deadlines_of_its_modes_ends_as_a_timeout():
-    """Search and approach by turns, each well within its own time: 3 s a mode, and no retry that is counted."""
+    """Search and approach alternate, each within its own deadline (3 s a mode), and no retry is counted."""
     bench = bring_to(Mode.ROUGH_APPROACH)
     bench.state = dc.replace(bench.state, since=bench.time)
     while bench.state.mode not in TERMINAL:

@@ -1,4 +1,4 @@
-"""teaching.py: what the hands learn from images, against what the simulation knows of its cameras."""
+"""teaching.py: the references and Jacobians from images, against the simulated cameras' true geometry."""
 
 import numpy as np
 import pytest

@@ -373,7 +373,7 @@ def test_in_lock_step_the_twin_ends_when_the_program_has_fallen_silent(monkeypat
 
 
 class Commanded:
-    """A twin in one process that is told where to drive, tick by tick."""
+    """A twin in this process whose base is commanded tick by tick."""
 
     def __init__(self):
         self.scenario = scenarios.resolve(near("hardware.lockstep=false"))
@@ -400,7 +400,7 @@ class Commanded:
 
     @property
     def told(self):
-        """The base's forward speed that the twin's own side has let pass."""
+        """The base's forward speed that the twin's guard passes to the joints."""
         return float(self.twin._guard.targets(self.twin._measured, False, self.twin.time)["base.twist_command"][0])
 
     @property
@@ -528,7 +528,7 @@ SPACE = ["unshare", "-rn", "sh", "-c", 'ip link set lo up && ip route add 224.0.
 
 
 def _space() -> str:
-    """Why there is no network namespace, or ""."""
+    """Why no network namespace can be made here; "" if one can."""
     if not all(map(shutil.which, ("unshare", "ip"))):
         return "no unshare or ip on this machine"
     tried = subprocess.run([*SPACE, "true"], capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""valve_search: finds the marker wherever it is, is not fooled by ghosts, keeps it centred, says when it is lost."""
+"""valve_search: finds the marker in any direction, ignores false detections, keeps it centred, reports its loss."""
 
 import dataclasses as dc
 import itertools
@@ -31,7 +31,7 @@ def in_view(X_OL: np.ndarray, p_OV: np.ndarray, shift: float = 0.0) -> bool:
 class World:
     """A robot that follows commands with a lag, and stereo sightings at most 8 times a second.
 
-    A pair of images takes `late` to be made, and the next one is begun when it is there.
+    Making a pair of images takes `late` seconds; the next pair is begun when it is finished.
     """
 
     p_OV: np.ndarray | None  # the marker, if there is one

@@ -30,7 +30,7 @@ def digest(path: Path) -> str:
 
 
 def start_child(path: Path, seconds: float) -> tuple[subprocess.Popen, float]:
-    """The writing process once its log has come to `seconds`, and its time then."""
+    """(a child process that is writing a log which has reached `seconds`, the log's time at that moment)."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([p for p in sys.path if p] + [os.getcwd()])}
     child = subprocess.Popen([sys.executable, CHILD, path], stdout=subprocess.PIPE, text=True, env=environment)
     now = 0.0
@@ -164,7 +164,7 @@ def test_sigterm_completes_the_log(tmp_path):
 
 
 def on_a_full_disk(path: Path) -> LogWriter:
-    """A log whose file takes nothing any more."""
+    """A LogWriter whose file refuses every further write, as on a full disk."""
     log = LogWriter(path)
     full = os.open("/dev/full", os.O_WRONLY)
     os.dup2(full, log._file.file.fileno())

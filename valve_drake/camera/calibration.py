@@ -19,7 +19,7 @@ Frames: L, R cameras; C one camera; T board. Lengths in m, pixels as in lens.py.
 import dataclasses as dc
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -221,9 +221,9 @@ class _Problem:
                 if not (Q[:, 2] > 1e-6).all():
                     return math.inf, H, g, residuals
                 xy = Q[:, :2] / Q[:, 2:]
-                seen, D, own = self.kind.project(lens, xy)
+                predicted, D, own = self.kind.project(lens, xy)
                 D = D @ divided(xy, Q[:, 2])
-                r = seen - px
+                r = predicted - px
                 columns = [np.arange(c * self.m, (c + 1) * self.m), np.arange(mine.start, mine.stop)]
                 blocks = [own, D @ dQ]
                 if dX is not None:
@@ -271,6 +271,15 @@ def _solve(views: Sequence[View], kind: _Kind, name: str, start: _State, size: t
 
 
 # ---------------------------------------------------------------- intrinsics and stereo
+
+
+class _Alone(NamedTuple):
+    """OpenCV's calibration of one camera by itself."""
+
+    rms: float  # [px]
+    K: np.ndarray  # (3, 3) [px]
+    dist: np.ndarray  # (5,)
+    poses: tuple[np.ndarray, ...]  # X_CT of each body
 
 
 @dc.dataclass(frozen=True)
@@ -449,10 +458,10 @@ def _sigma_maps(opencv: Fit, fit: Fit, views: Sequence[View], size: tuple[int, i
     for c, (lens, chosen) in enumerate(zip(lenses, fit.lenses)):
         own = slice(c * len(kind.names), (c + 1) * len(kind.names))
         C = inverse[own, own]
-        seen = np.vstack([view.px[c] for view in views])
-        seen = seen[:: max(len(seen) // 500, 1)]
+        corner_px = np.vstack([view.px[c] for view in views])
+        corner_px = corner_px[:: max(len(corner_px) // 500, 1)]
         J, turn, other = [], [], []
-        for px in (seen, grid):
+        for px in (corner_px, grid):
             xy = lens.normalize(px)
             _, D, by_lens = kind.project(lens, xy)
             rays = np.column_stack([xy, np.ones(len(xy))])
@@ -474,37 +483,36 @@ def _start(views: Sequence[View], size: tuple[int, int], kind: _OpenCvKind, rigi
     for k, name in ((0, "K1"), (1, "K2"), (4, "K3")):
         flags |= 0 if k in kind.free else getattr(cv2, f"CALIB_FIX_{name}")
     flags |= 0 if 2 in kind.free else cv2.CALIB_ZERO_TANGENT_DIST
-    alone, seen = [], []
+    alone: list[_Alone] = []
     for c in range(len(views[0].px)):
         px = [np.vstack([view.px[c] for view in group]).astype(np.float32) for group in groups]
         # OpenCV needs an initial K for a target that is not flat: three focal lengths are tried, the best fit is kept.
         guesses = [f * size[0] for f in (0.7, 1.4, 2.8)] if rigid else [None]
-        best = None
+        best: _Alone | None = None
         for guess in guesses:
             K, more = None, 0
             if guess is not None:
                 K, more = np.array([[guess, 0, (size[0] - 1) / 2], [0, guess, (size[1] - 1) / 2], [0, 0, 1.0]]), 1
             try:
-                found = cv2.calibrateCameraExtended(
+                rms, K, dist, rvecs, tvecs, *_ = cv2.calibrateCameraExtended(
                     points, px, size, K, np.zeros(5), flags=flags | (cv2.CALIB_USE_INTRINSIC_GUESS if more else 0)
                 )
             except cv2.error:
                 continue
-            if np.isfinite(found[0]) and (best is None or found[0] < best[0]):
-                best = found
+            if np.isfinite(rms) and (best is None or rms < best.rms):
+                poses = tuple(transform(rvec, tvec) for rvec, tvec in zip(rvecs, tvecs))
+                best = _Alone(rms, K, dist.ravel(), poses)
         if best is None:
             raise ConfigError(f"degenerate: the boards do not determine a camera: {_TILT}")
         if not rigid:
-            _refuse_frontal([cv2.Rodrigues(rvec)[0][:, 2] for rvec in best[3]])
-        alone.append((best[1], best[2].ravel(), best[3], best[4], best[0]))
-        seen.append(px)
-    lenses = [(K, dist) for K, dist, *_ in alone]
-    poses = [tuple(transform(r, t) for r, t in zip(*one[2:4])) for one in alone]
-    rms = tuple(one[4] for one in alone)
+            _refuse_frontal([X_CT[:, 2] for X_CT in best.poses])
+        alone.append(best)
+    lenses = [(camera.K, camera.dist) for camera in alone]
+    each_rms = tuple(camera.rms for camera in alone)
     if len(alone) == 1:
-        return _Start(tuple(views), lenses, None, poses[0], rms, [])
+        return _Start(tuple(views), lenses, None, alone[0].poses, each_rms, [])
     turns = board.turns() if board and not rigid else (0,)
-    X_LR, chosen, off = _one_right_camera(poses[0], poses[1], turns)
+    X_LR, chosen, off = _one_right_camera(alone[0].poses, alone[1].poses, turns)
     if board:
         views = [
             dc.replace(view, px=(view.px[0], board.turned(view.px[1], chosen[view.body])))
@@ -512,7 +520,8 @@ def _start(views: Sequence[View], size: tuple[int, int], kind: _OpenCvKind, rigi
             else view
             for view in views
         ]
-    return _Start(tuple(views), lenses, X_LR, poses[0], rms, [view.names for view in views if off[view.body]])
+    misfits = [view.names for view in views if off[view.body]]
+    return _Start(tuple(views), lenses, X_LR, alone[0].poses, each_rms, misfits)
 
 
 def _one_right_camera(
@@ -534,16 +543,16 @@ def _one_right_camera(
         turned = [frames.compose(right, frames.make(frames.rot_z(k * math.pi / 2), np.zeros(3))) for k in turns]
         candidates.append([frames.compose(left, frames.inverse(X)) for X in turned])
     best: tuple[float, np.ndarray] | None = None
-    for X in (X for one in candidates for X in one):
-        nearest = [min(distance(X, other, scale) for other in one) for one in candidates]
+    for X in (X for of_pair in candidates for X in of_pair):
+        nearest = [min(distance(X, other, scale) for other in of_pair) for of_pair in candidates]
         # If all boards lie alike, every numbering fits; prefer the one by which both cameras look the same way.
         cost = float(np.minimum(nearest, _APART).sum()) + 1e-3 * distance(np.eye(3, 4), X, scale)
         if best is None or cost < best[0]:
             best = cost, X
     assert best is not None  # there is a board in each view
     X_LR = best[1]
-    off = [[distance(X_LR, other, scale) for other in one] for one in candidates]
-    return X_LR, [turns[int(np.argmin(one))] for one in off], [min(one) > _APART for one in off]
+    off = [[distance(X_LR, other, scale) for other in of_pair] for of_pair in candidates]
+    return X_LR, [turns[int(np.argmin(of_pair))] for of_pair in off], [min(of_pair) > _APART for of_pair in off]
 
 
 def _refuse_frontal(normals: Sequence[np.ndarray]) -> None:
@@ -624,14 +633,14 @@ def _sights(fit: Fit, distance: float) -> tuple[np.ndarray, np.ndarray]:
     ahead = (np.array([0, 0, 1]) + R[:, 2]) / np.linalg.norm(np.array([0, 0, 1]) + R[:, 2])
     side, up = np.meshgrid([-0.1, 0, 0.1], [-0.1, 0, 0.1])
     P = p / 2 + distance * (ahead + np.stack([side, up, 0 * up], -1).reshape(-1, 3))
-    seen, px = np.ones(len(P), bool), []
+    visible, px = np.ones(len(P), bool), []
     for lens, Q in zip(fit.lenses, (P, (P - p) @ R)):
         xy = Q[:, :2] / Q[:, 2:]
         px.append(lens.project(xy))
-        seen &= (Q[:, 2] > 0) & ((px[-1] >= 0) & (px[-1] <= [lens.width - 1, lens.height - 1])).all(1)
+        visible &= (Q[:, 2] > 0) & ((px[-1] >= 0) & (px[-1] <= [lens.width - 1, lens.height - 1])).all(1)
         # Outside the image a lens model may fold back: such points project into the image but are not seen there.
-        seen &= np.linalg.norm(lens.normalize(px[-1]) - xy, axis=1) < 1e-3
-    return px[0][seen], px[1][seen]
+        visible &= np.linalg.norm(lens.normalize(px[-1]) - xy, axis=1) < 1e-3
+    return px[0][visible], px[1][visible]
 
 
 def triangulate_all(head: StereoHead, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -687,7 +696,7 @@ def _depth_sigma(fit: Fit, kind: _Kind, size: tuple[int, int]) -> dict[float, fl
         px = _sights(fit, distance)
         if not len(px[0]):
             continue
-        middle = [one[[len(one) // 2]] for one in px]
+        middle = [points[[len(points) // 2]] for points in px]
         J = []
         for k, s in enumerate(sigma):
             depth = []
