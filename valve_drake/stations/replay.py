@@ -38,6 +38,7 @@ from valve_drake.stations.contract import CAMERAS, CONTRACT, station_of
 JOINTS, HEALTH, OPERATOR = "/joint_states", "/health", "/operator/command"
 WRENCHES = {f"/{side}_wrist/wrench": f"{side}_wrist.wrench" for side in SIDES}
 CONSUMERS = {topic_of(port) for port, _, _ in FRAMES.values()}
+_MEASURED = {port: [name.split(".") for name in names] for port, names in MEASURED.items()}  # joint, quantity
 IMAGES = {f"/{camera}/image": camera for camera in CAMERAS}
 
 
@@ -109,13 +110,13 @@ class Recording:
 
     def _add_joints(self, time: float, states: JointStates) -> None:
         joints = {joint.name: joint for joint in states.joints}
-        for port, names in MEASURED.items():
+        for port, parts in _MEASURED.items():
             values = []
-            for name in names:
-                joint, quantity = name.split(".")
-                if joint not in joints or not joints[joint].HasField(quantity):
-                    raise ConfigError(f"{self._log.path}: {JOINTS} has no {name}")
-                values.append(getattr(joints[joint], quantity))
+            for name, quantity in parts:
+                joint = joints.get(name)
+                if joint is None or not joint.HasField(quantity):
+                    raise ConfigError(f"{self._log.path}: {JOINTS} has no {name}.{quantity}")
+                values.append(getattr(joint, quantity))
             self.tracks[port].add(time, np.array(values))
 
     def _add_frames(self, topic: str, time: float, message: Any) -> None:
