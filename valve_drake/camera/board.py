@@ -156,11 +156,11 @@ def pair_images(left: Sequence[Path], right: Sequence[Path]) -> Pairs:
 def _varying_parts(left: Sequence[str], right: Sequence[str]) -> list[list[tuple[Any, ...]]] | None:
     """The parts (texts, numbers) of each name that are not the same in all names of its side; None if not unique."""
     parts = [[natural(name) for name in names] for names in (left, right)]
-    if len({len(one) for side in parts for one in side}) != 1:
+    if len({len(name) for side in parts for name in side}) != 1:
         return None
     places = range(len(parts[0][0]))
-    varying = [k for k in places if any(len({one[k] for one in side}) > 1 for side in parts)]
-    keys = [[tuple(one[k] for k in varying) for one in side] for side in parts]
+    varying = [k for k in places if any(len({name[k] for name in side}) > 1 for side in parts)]
+    keys = [[tuple(name[k] for k in varying) for name in side] for side in parts]
     return keys if all(len(set(side)) == len(side) for side in keys) else None
 
 

@@ -1,14 +1,14 @@
 """Hand-eye calibration: where a camera sits on the hand, or beside the robot, from boards and the arm's poses.
 
-Two things are noisy: the corners, and the arm, which is not where it says it is. A fit of the corners alone (bundle
-adjustment with the arm's poses taken as exact) pays the arm's position error in the camera's rotation. Here each view
-says where the arm was, once by its corners and once by the arm itself. The difference of the two, in rotation w and
-position t, has the covariance
+Two things are noisy: the corners, and the arm, whose reported pose is not its true one. A fit of the corners alone
+(bundle adjustment with the arm's poses taken as exact) turns the arm's position error into an error of the camera's
+rotation. Here each view gives the arm's pose twice: from its corners, and as the arm reports it. The difference of the
+two, in rotation w and position t, has the covariance
 
     V = G P G^T + diag(a I, b I)
 
 P of the board's pose by the corners' noise, a [rad^2] and b [m^2] the variances of the arm. Generalised least squares
-finds the camera and the board for given a, b. Restricted likelihood (REML) says how well a, b explain the views; the
+finds the camera and the board for given a, b. Restricted likelihood (REML) rates how well a, b explain the views; the
 result is the mean over all a, b by that likelihood, so that its covariance includes that a, b are estimates.
 
 Frames: B robot base, E hand, C camera, T board. Lengths in m, pixels as in lens.py. On the hand (the board stands):
@@ -19,7 +19,7 @@ import dataclasses as dc
 import itertools
 import math
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -39,13 +39,13 @@ METHODS = {
     "Daniilidis": cv2.CALIB_HAND_EYE_DANIILIDIS,
 }
 MIN_VIEWS = 3
-STANDS_OUT = 5.0  # standard deviations (rms of six) beyond which a view is a blunder; no noise of an arm is so large
-_MAX_BLUNDERS = 0.25  # of the views that may be left out
-_MIN_PX = 1e-3  # the corners' noise is taken to be no less: drawn corners are exact
-_SURE = 30.0  # squared residuals, in units of the noise, by which the second pose of a board is out of the question
+STANDS_OUT = 5.0  # a view farther off is a blunder; raise it if good views are left out [standard deviations]
+_MAX_BLUNDERS = 0.25  # share of the views that may be left out
+_MIN_PX = 1e-3  # least noise of the corners that is assumed, since drawn corners are exact [px]
+_SURE = 30.0  # a board's second pose is dropped if its squared residuals are larger by this [variances of the noise]
 _MAX_TURN = 0.3  # of one step [rad]
 _STEPS = 10  # of each variance's grid
-_VISIBLE = 0.1  # where that grid begins, as a share of the corners' own variance
+_VISIBLE = 0.1  # least variance of that grid, as a share of the variance by the corners
 # An arm may well be too exact for the corners to tell; prior odds of that, in units of the prior of one e-fold of
 # variance. Less makes the covariance too large for exact arms, more too small for arms that are just visible.
 _EXACT_ARM = 20.0
@@ -53,7 +53,7 @@ _EXACT_ARM = 20.0
 
 @dc.dataclass(frozen=True)
 class Seen:
-    """What n views say: the arm by itself, and the board by its corners."""
+    """The measurements of n views: the arm's pose as it reports it, and the board's by its corners."""
 
     arm: np.ndarray  # (n, 3, 4) X_BE
     board: np.ndarray  # (n, 3, 4) X_CT
@@ -105,7 +105,7 @@ class HandEye:
     left_out_mm: np.ndarray
     off: np.ndarray  # (n,) how far each view is off, in standard deviations (rms of its six numbers)
     used: tuple[int, ...]  # the views that are not blunders
-    view_rms: np.ndarray  # (n,) of the corners, with the arm where it says it is [px]
+    view_rms: np.ndarray  # (n,) of the corners, with the arm at its reported pose [px]
     rms: float  # of the used views [px]
     methods: dict[str, "Method"]  # published ones, on the same views
 
@@ -122,7 +122,7 @@ class HandEye:
 
 @dc.dataclass(frozen=True)
 class Method:
-    """A published method on the used views: how far from our X, and how well it foretells a view left out (rms)."""
+    """A published method on the used views: how far from our X, and its error in predicting a view left out (rms)."""
 
     apart_deg: float
     apart_mm: float
@@ -130,21 +130,24 @@ class Method:
     left_out_mm: float
 
 
-# ---------------------------------------------------------------- what the views say
+# ---------------------------------------------------------------- from images to poses
 
 
 def board_pose(lens: LensModel, points: np.ndarray, px: np.ndarray) -> np.ndarray:
     """X_CT (3, 4) of a planar board by its corners' least squares."""
-    return _boards(lens, points, px)[0][0]
+    return _boards(lens, points, px)[0].X
 
 
-def _boards(lens: LensModel, points: np.ndarray, px: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """The one or two poses that explain the corners, the better one first.
+class _BoardPose(NamedTuple):
+    X: np.ndarray  # (3, 4) X_CT
+    information: np.ndarray  # (6, 6) by corners with a noise of 1 px
+    squares: float  # sum of squared residuals [px^2]
 
-    Each: X_CT (3, 4), the information (6, 6) of corners with a noise of 1 px, the sum of squared residuals [px^2].
-    """
+
+def _boards(lens: LensModel, points: np.ndarray, px: np.ndarray) -> list[_BoardPose]:
+    """The one or two poses that explain the corners, the better one first. Raises ConfigError if there is none."""
     xy, S = lens.normalize(px), skew(points)
-    to_px = np.linalg.inv(lens.normalize_jacobian(px))  # the corners' noise is even in the raw image
+    to_px = np.linalg.inv(lens.normalize_jacobian(px))  # the corners' noise is the same all over the raw image
     out = []
     for rvec, tvec in zip(*cv2.solvePnPGeneric(points, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)[1:3]):
         X = transform(*cv2.solvePnPRefineLM(points, xy, np.eye(3), None, rvec, tvec))
@@ -157,10 +160,10 @@ def _boards(lens: LensModel, points: np.ndarray, px: np.ndarray) -> list[tuple[n
             H = J.T @ J
             X = stepped(X, -np.linalg.solve(H, J.T @ r))
         if np.isfinite(X).all() and X[2, 3] > 0:
-            out.append((X, H, float(r @ r)))
+            out.append(_BoardPose(X, H, float(r @ r)))
     if not out:
         raise ConfigError("hand-eye: the corners are not those of a board seen through this lens")
-    return sorted(out, key=lambda one: one[2])
+    return sorted(out, key=lambda pose: pose.squares)
 
 
 def observe(
@@ -171,25 +174,26 @@ def observe(
     to_hand: bool = False,
 ) -> Seen:
     """points (m, 3) in T, corners [(m, 2)] raw px and X_BE (3, 4) of each view."""
-    found = [_boards(lens, points, px) for px in corners]
+    poses = [_boards(lens, points, px) for px in corners]
+    first, second = [of_view[0] for of_view in poses], [of_view[-1] for of_view in poses]  # the same if there is one
     freedom = sum(2 * len(px) - 6 for px in corners)
-    px = max(math.sqrt(sum(one[0][2] for one in found) / max(freedom, 1)), _MIN_PX)
-    cost = np.array([(one[-1][2] - one[0][2]) / px**2 for one in found])
-    same = [np.abs(one[-1][0] - one[0][0]).max() < 1e-6 for one in found]
+    px = max(math.sqrt(sum(pose.squares for pose in first) / max(freedom, 1)), _MIN_PX)
+    cost = np.array([(b.squares - a.squares) / px**2 for a, b in zip(first, second)])
+    same = [np.abs(b.X - a.X).max() < 1e-6 for a, b in zip(first, second)]
     return Seen(
         arm=np.array(X_BE, float),
-        board=np.array([one[0][0] for one in found]),
-        covariance=px**2 * np.linalg.inv(np.array([one[0][1] for one in found])),
+        board=np.array([pose.X for pose in first]),
+        covariance=px**2 * np.linalg.inv(np.array([pose.information for pose in first])),
         to_hand=to_hand,
         px=px,
-        second=np.array([one[-1][0] for one in found]),
-        second_covariance=px**2 * np.linalg.inv(np.array([one[-1][1] for one in found])),
+        second=np.array([pose.X for pose in second]),
+        second_covariance=px**2 * np.linalg.inv(np.array([pose.information for pose in second])),
         second_cost=np.where(same | (cost > _SURE), np.inf, cost),
     )
 
 
 def settled(seen: Seen, used: Sequence[int] | None = None) -> Seen:
-    """The views with the one of two board poses that suits the arm, as the views `used` have it."""
+    """The views, each with that of its two board poses that agrees with the arm by the fit to the views `used`."""
     for _ in range(3):
         if not np.isfinite(seen.second_cost).any():
             break
@@ -214,7 +218,7 @@ def settled(seen: Seen, used: Sequence[int] | None = None) -> Seen:
 
 
 def _arm_errors(X: np.ndarray, Y: np.ndarray, seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the corners put the arm against where it says it is.
+    """The arm's pose by the corners against the reported one.
 
     Returns e (n, 6), turn about E's axes [rad] and displacement in B [m]; d e / d (X, Y) (n, 6, 12); and the
     covariance of e by the corners' noise (n, 6, 6).
@@ -265,7 +269,7 @@ def solve(seen: Seen, X: np.ndarray | None = None) -> Fit:
         step = weights @ steps
         if not np.isfinite(step).all():
             raise ConfigError("hand-eye: no solution; do the poses belong to the images?")
-        # Poses that belong to other images start far off: no step turns by more than is nearly linear.
+        # Poses of other images start far off: a step is limited to a rotation in which the problem is nearly linear.
         step *= min(1.0, _MAX_TURN / max(np.abs(step[[0, 1, 2, 6, 7, 8]]).max(), 1e-12))
         X, Y = stepped(X, step[:6]), stepped(Y, step[6:])
         covariance = np.tensordot(weights, covariances, 1) + (weights * (steps - step).T) @ (steps - step)
@@ -333,7 +337,7 @@ def _window(e: np.ndarray, B: np.ndarray, V: np.ndarray, window: np.ndarray | No
         step = (window[k, 1] - window[k, 0]) / (_STEPS - 1)
         likely = np.flatnonzero(share >= 1e-4 * share.max())
         out[k] = window[k, 0] + step * np.array([likely[0] - 1, likely[-1] + 1])
-        if out[k, 1] > window[k, 1]:  # nothing says yet where it ends
+        if out[k, 1] > window[k, 1]:  # no upper end was found yet
             out[k, 1] += 2 * step
     return np.maximum(out, np.log(floors)[:, None] + [0, 1])
 
@@ -371,7 +375,7 @@ def published(carriers: Poses, boards: Poses, method: int) -> np.ndarray:
     """X (3, 4) by one of OpenCV's METHODS. Raises ConfigError if it finds none."""
     logging = cv2.utils.logging
     level = logging.getLogLevel()
-    logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # it writes to the terminal what we say ourselves
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # OpenCV would write to the terminal what the exception says
     try:
         R, t = cv2.calibrateHandEye(
             [X[:, :3] for X in carriers],
@@ -397,13 +401,13 @@ def deviations(fit: Fit, seen: Seen, used: Sequence[int] = ()) -> np.ndarray:
     e, B, V = _arm_errors(fit.X, fit.Y, seen)
     V = V + np.diag(np.repeat(fit.variances, 3))
     others = ~np.isin(np.arange(len(seen)), list(used))
-    V[others] += (B @ fit.covariance @ _T(B))[others]  # a view of the fit is drawn to it instead
+    V[others] += (B @ fit.covariance @ _T(B))[others]  # not of the views that made the fit
     off: np.ndarray = np.sqrt(np.einsum("ni,nij,nj->n", e, np.linalg.inv(V), e) / 6)
     return off
 
 
 def majority(seen: Seen, tries: int = 40) -> list[int]:
-    """The views that agree with each other, whatever the others say: triples of views, judged by the median."""
+    """The views that agree with most others: the fit to three views with the least median deviation decides."""
     n, best, start = len(seen), math.inf, None
     if n < 6:
         return list(range(n))
@@ -456,7 +460,7 @@ def hand_eye(
 
 def from_seen(seen: Seen, lens: LensModel, points: np.ndarray, corners: Sequence[np.ndarray]) -> HandEye:
     """As `hand_eye`, of views observed already."""
-    closed_hand_eye(seen.carriers(), seen.board)  # refuses what no view determines
+    closed_hand_eye(seen.carriers(), seen.board)  # refuses poses that do not determine the camera
     seen = settled(seen, majority(seen))
     used = majority(seen)
     if len(seen) - len(used) > _MAX_BLUNDERS * len(seen):
@@ -525,7 +529,7 @@ def disagreement(seen: Seen) -> np.ndarray:
 
 
 def predicted(X: np.ndarray, Y: np.ndarray, seen: Seen) -> list[np.ndarray]:
-    """X_CT (3, 4) of each view, with the arm where it says it is."""
+    """X_CT (3, 4) of each view by the arm's reported pose."""
     return [frames.compose(frames.inverse(X), frames.inverse(one), Y) for one in seen.carriers()]
 
 

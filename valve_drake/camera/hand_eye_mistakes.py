@@ -1,8 +1,8 @@
 """Whether poses belong to the images at all, and if not, which usual mistake explains it.
 
-No arm scatters by degrees. Poses that disagree with the boards so much are refused, and what people get wrong is tried:
-the inverse, the other mount, transposed rotations, quaternions in the other order, Euler angles in the other order,
-millimetres, the neighbour's image, exchanged poses.
+No arm scatters by several degrees, so poses that disagree with the boards by so much are refused. Usual mistakes are
+tried before, so that the refusal can name one: the inverse, the other mount, transposed rotations, quaternions or Euler
+angles in the other order, millimetres, the neighbour's image, exchanged poses.
 """
 
 import dataclasses as dc
@@ -27,10 +27,10 @@ from valve_drake.checks import ConfigError
 
 MAX_SCATTER_DEG, MAX_SCATTER_MM = 3.0, 50.0  # of the arm: more is no arm, the poses are wrong
 LARGE_SCATTER_DEG, LARGE_SCATTER_MM = 1.0, 10.0  # more than most arms: worth a warning
-_BETTER = 4.0  # times, so that a mistake explains the disagreement
+_BETTER = 4.0  # a mistake explains the disagreement if undoing it makes it smaller by this factor
 _FINE_DEG, _FINE_MM = 1.0, 10.0  # views that disagree by less are not suspected
-_REACH = 5.0  # positions that lie farther apart are no metres [m]
-_FEWEST = 4  # views with which a mistake is tried
+_REACH = 5.0  # positions farther apart are taken for millimetres [m]
+_FEWEST = 4  # least number of views with which mistakes are tried
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 
 
@@ -40,7 +40,7 @@ class Poses:
 
     names: tuple[str, ...]
     X_BE: np.ndarray  # (N, 3, 4)
-    used: tuple[int, ...]  # of each view its place among them
+    used: tuple[int, ...]  # index in X_BE of each view
 
 
 def refuse_mistakes(seen: Seen, poses: Poses) -> None:
@@ -109,7 +109,7 @@ def _better(seen: Seen, poses: Poses, size: np.ndarray) -> str:
 
 
 def _freedom(seen: Seen) -> float:
-    """By how much residuals are too small because they made the fit: three views nearly fit anything."""
+    """Factor by which residuals are too small because the same views made the fit: three views fit nearly anything."""
     return math.sqrt(len(seen) / (len(seen) - 2))
 
 
