@@ -307,9 +307,9 @@ def _outline_with_most_of(mask: np.ndarray, inside: np.ndarray, step: int) -> np
     outlines = sorted(_outlines(mask), key=cv2.contourArea, reverse=True)[:3]
     held = []
     for outline in outlines if len(outlines) > 1 else ():
-        filled = np.zeros(mask.shape, np.uint8)
-        cv2.drawContours(filled, [outline], -1, 255, -1)
-        filled = np.ascontiguousarray(filled[::step, ::step][: inside.shape[0], : inside.shape[1]])
+        drawn: np.ndarray = np.zeros(mask.shape, np.uint8)
+        cv2.drawContours(drawn, [outline], -1, 255, -1)
+        filled: np.ndarray = np.ascontiguousarray(drawn[::step, ::step][: inside.shape[0], : inside.shape[1]])
         held.append(cv2.countNonZero(cv2.bitwise_and(filled, inside[: filled.shape[0], : filled.shape[1]])))
     if held:
         return outlines[int(np.argmax(held))] if max(held) else None

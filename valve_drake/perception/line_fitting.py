@@ -188,7 +188,7 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
         parts.append((k, channel, low, start - low, clipped))
     if not parts:
         return out
-    number, channels, lows, near, clipped = zip(*parts)
+    number, channels, lows, near, clips = zip(*parts)
     sheet = Sheet.of(channels)
     coarse = _hough_corners(sheet, np.array(near) + sheet.low[:, None])
     sides, reasons = _place(sheet, coarse, config)
@@ -207,8 +207,8 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
             back = lows[q] - sheet.low[q]
             together = None if raw.together is None else raw.together + back
             raw = dc.replace(raw, points=raw.points + back, together=together)
-            if clipped[q].any():
-                raw = dc.replace(raw, bias=_CLIPPED_BIAS * max(raw.blur, _START_BLUR) * clipped[q])
+            if clips[q].any():
+                raw = dc.replace(raw, bias=_CLIPPED_BIAS * max(raw.blur, _START_BLUR) * clips[q])
         out[k] = raw
     return out
 

@@ -187,9 +187,10 @@ def _estimate(
     ambiguity = fits[1].cost - best.cost if len(fits) > 1 else 0.0
     if config.method == "paper":
         step, refined = _contradiction(moments, model, best), best
-        best, covariance, reason = _paper(views, model, config)
-        if reason:
+        fit, paper_covariance, reason = _paper(views, model, config)
+        if fit is None or paper_covariance is None:
             return _refuse(edges, config, reason)
+        best, covariance = fit, paper_covariance
         inflation = 1.0
         if step is not None:  # from this pose to the one that the other camera makes of the refined one
             step = np.append(frames.rotation_vector(best.R.T @ refined.R), refined.p - best.p) + step
@@ -198,9 +199,10 @@ def _estimate(
         if not told:
             weights = [_weights(view, _point_residuals(view, best, model), config) for view in views]
             moments = _moments(views, weights, config)
-        best = _refine(moments, model, best.R, best.p, best.yaw, config, at=best.at if told else None)
-        if best is None:
+        fit = _refine(moments, model, best.R, best.p, best.yaw, config, at=best.at if told else None)
+        if fit is None:
             return _refuse(edges, config, "no pose explains the sides")
+        best = fit
         covariance = _covariance(moments, model, best)
         # Misfit of whole sides, that independent points do not show: calibration, a marker that is not flat.
         inflation = (best.cost - moments.floor) / (8 * len(views) - 6)
@@ -233,8 +235,8 @@ def _estimate(
         ambiguity=float(ambiguity),
         residual_px=residual,
         axis_known=axis_known,
-        corners_left=edges.left.corners_px if edges.left.found else [],
-        corners_right=edges.right.corners_px if edges.right.found else [],
+        corners_left=edges.left.corners_px if edges.left.found else np.zeros((0, 2)),
+        corners_right=edges.right.corners_px if edges.right.found else np.zeros((0, 2)),
         reason=reason,
     )
 
@@ -276,9 +278,10 @@ def _view(
         corners, trust = quad.corners, np.ones(len(side))
         lines = _joining(corners)
     else:
-        lines, trust = _robust_lines(quad.points, side, sigma / lens.focal(), config)
-        if lines is None:
+        robust, trust = _robust_lines(quad.points, side, sigma / lens.focal(), config)
+        if robust is None:
             return "sides do not make a quadrilateral"
+        lines = robust
         corners = meet(lines)
     d = corners[NEXT] - corners
     turning = d[:, 0] * d[NEXT, 1] - d[:, 1] * d[NEXT, 0]
@@ -544,7 +547,7 @@ def _refine(
         yaw_new = yaw + step[6] if known else yaw
         trial = _linearize(moments, model, R_new, p_new, yaw_new)
         cost_new = math.inf if trial is None else trial[0] @ trial[0] + known * yaw_new**2
-        if cost_new <= cost:
+        if trial is not None and cost_new <= cost:
             R, p, yaw, at, cost = R_new, p_new, yaw_new, trial, cost_new
             damping = max(damping / 10, 1e-9)
         else:
@@ -961,7 +964,7 @@ def fuse(estimates: Sequence[RectangleEstimate], common: float = 0.2, gate: floa
     poses = [frames.compose(e.X_OL, e.X_LV) for e in good]
     reference = next((k for k, e in enumerate(good) if e.axis_known), 0)
     R0, p0 = poses[reference][:, :3], poses[reference][:, 3]
-    errors, covariances = [], []
+    offsets, spreads = [], []
     for e, X in zip(good, poses):
         R, sign = X[:, :3], np.ones(6)
         if R[:, 0] @ R0[:, 0] < 0:  # the bar's two ends look alike
@@ -969,9 +972,9 @@ def fuse(estimates: Sequence[RectangleEstimate], common: float = 0.2, gate: floa
         to_O = np.eye(6)
         to_O[3:, 3:] = e.X_OL[:, :3]
         C = to_O @ e.covariance @ to_O.T
-        covariances.append(C * np.outer(sign, sign))
-        errors.append(np.append(frames.rotation_vector(R0.T @ R), X[:, 3] - p0))
-    errors, covariances = np.array(errors), np.array(covariances)
+        spreads.append(C * np.outer(sign, sign))
+        offsets.append(np.append(frames.rotation_vector(R0.T @ R), X[:, 3] - p0))
+    errors, covariances = np.array(offsets), np.array(spreads)
     off = errors - np.median(errors, axis=0)
     scatter = 1.48 * np.median(np.abs(off), axis=0)
     scale = np.maximum(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)), scatter)
