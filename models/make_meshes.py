@@ -34,7 +34,7 @@ def at(mesh, x=0.0, y=0.0, z=0.0, rpy=(0, 0, 0)):
 
 
 def along(axis, mesh):
-    """The mesh with its z axis laid along `axis` (the axes change places in a cycle)."""
+    """The mesh with its z axis along `axis` (x, y, z are permuted cyclically)."""
     return mesh[0][:, {"x": [2, 0, 1], "y": [1, 2, 0], "z": [0, 1, 2]}[axis]], mesh[1]
 
 
@@ -108,7 +108,7 @@ def patch(rows, z, degrees, offset=0.0025, sides=16, steps=6, rounded=False):
 
 def lathe(profile, sides=0):
     """Body of revolution about z: profile rows (z, radius); z rises along it for a solid."""
-    sides = sides or 10 + int(160 * max(r for _, r in profile))  # enough for its size
+    sides = sides or 10 + int(160 * max(r for _, r in profile))  # more sides for a larger radius
     theta = np.arange(sides) * 2 * np.pi / sides
     return capped(np.array([[[r * np.cos(t), r * np.sin(t), z] for t in theta] for z, r in profile]))
 
@@ -155,7 +155,7 @@ def inset(outline, distance):
 
 
 def prism(outline, z0, z1, bevel=0.002):
-    """The outline (counter-clockwise, seen whole from its mean) drawn out along z."""
+    """The outline (counter-clockwise, star-shaped about its mean) extruded along z."""
     if bevel:
         rings = [(inset(outline, bevel), z0), (outline, z0 + bevel), (outline, z1 - bevel), (inset(outline, bevel), z1)]
     else:
@@ -487,7 +487,7 @@ def wheel():
 
 
 def opposite(mesh):
-    """What stands at the wall y = 5.4, at the wall y = -5.4 instead."""
+    """The mesh turned by half a turn about z: from the wall y = 5.4 to the wall y = -5.4."""
     return at(mesh, rpy=(0, 0, 180))
 
 
@@ -584,7 +584,7 @@ def trim():
 
 
 def decoys():
-    """More things that are red or green, but no marker."""
+    """Red and green things that are no markers, to be rejected by the segmentation."""
     leaf = lathe([(-0.30, 0.004), (-0.12, 0.055), (0.06, 0.075), (0.22, 0.045), (0.32, 0.003)], 6)
     for k, a in enumerate(np.arange(9) * 0.698):
         lean = (-25 * np.sin(a), 30 * np.cos(a), np.rad2deg(a))
