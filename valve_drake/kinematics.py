@@ -15,6 +15,7 @@ Frames: frames.py. The numbers below are those of models/robot/robot.sdf; a test
 """
 
 import dataclasses as dc
+import math
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from valve_drake.frames import compose, cross, make, planar, rot_x, rot_y, rot_z
 from valve_drake.messages import LEFT, RIGHT
 
 ARM_LIMITS = np.array([2.97, 2.09, 2.62, 3.32, 2.09, 3.14])  # +- [rad]
+_LIMITS = tuple(ARM_LIMITS.tolist())
 MIRROR = np.array([1.0, -1, -1, -1, -1, -1])  # left arm to right arm: all axes but the lateral J1 change sign
 R_G0 = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # R_HG at zero: x_G = y_H, y_G = z_H, z_G = x_H
 
@@ -104,56 +106,66 @@ class RobotGeometry:
 
         J4 and J6 are taken as near as possible to `q_near` (zero by default); both wrist branches are tried.
         """
-        near = np.zeros(6) if q_near is None else q_near
-        R, p = X_HG[:, :3], X_HG[:, 3]
-        w = p - self.hand * R[:, 2] - self.shoulder(side)
-        x, y = np.hypot(w[0], w[2]), w[1]
-        q1 = np.arctan2(-w[2], w[0])
+        near = [0.0] * 6 if q_near is None else q_near.tolist()
+        rows = X_HG.tolist()
+        if not all(map(math.isfinite, [*rows[0], *rows[1], *rows[2], *near[3:]])):
+            return None
+        # Plain floats: numpy takes five times as long for so few numbers, and both arms need this at every tick.
+        (x_x, y_x, z_x, p_x), (x_y, y_y, z_y, p_y), (x_z, y_z, z_z, p_z) = rows  # x_G, y_G, z_G, p_HG, each in H
+        w_x = p_x - self.hand * z_x
+        w_y = p_y - self.hand * z_y - self.shoulder_half_width * lateral(side)
+        w_z = p_z - self.hand * z_z
+        x, y = math.hypot(w_x, w_z), w_y
+        q1 = math.atan2(-w_z, w_x)
         l1, l2 = self.upper_arm, self.forearm
         cos3 = (x * x + y * y - l1 * l1 - l2 * l2) / (2 * l1 * l2)
         if not abs(cos3) < 1:
             return None
-        q3 = -lateral(side) * np.arccos(cos3)
-        q2 = np.arctan2(y, x) - np.arctan2(l2 * np.sin(q3), l1 + l2 * np.cos(q3))
-        M = (rot_y(q1) @ rot_z(q2 + q3)).T @ R @ R_G0.T
-        best, cost = None, np.inf
+        q3 = -lateral(side) * math.acos(cos3)
+        q2 = math.atan2(y, x) - math.atan2(l2 * math.sin(q3), l1 + l2 * math.cos(q3))
+        # M = (R_y(q1) R_z(q2 + q3))^T R_HG R_G0^T; the columns of R_HG R_G0^T are z_G, x_G, y_G.
+        c1, s1, c, s = math.cos(q1), math.sin(q1), math.cos(q2 + q3), math.sin(q2 + q3)
+        M_00 = c1 * c * z_x + s * z_y - s1 * c * z_z
+        M_01 = c1 * c * x_x + s * x_y - s1 * c * x_z
+        M_02 = c1 * c * y_x + s * y_y - s1 * c * y_z
+        M_10 = -c1 * s * z_x + c * z_y + s1 * s * z_z
+        M_20 = s1 * z_x + c1 * z_z
+        best, cost = None, math.inf
         for sign in (1.0, -1.0):
-            s5 = sign * np.hypot(M[1, 0], M[2, 0])
-            q5 = np.arctan2(s5, M[0, 0])
+            s5 = sign * math.hypot(M_10, M_20)
+            q5 = math.atan2(s5, M_00)
             if abs(s5) < 1e-9:  # wrist straight: J4 and J6 turn about one axis; keep J4
                 q4 = near[3]
-                T = rot_x(q4).T @ M
-                q6 = np.arctan2(T[2, 1], T[1, 1])
+                M_11 = -c1 * s * x_x + c * x_y + s1 * s * x_z
+                M_21 = s1 * x_x + c1 * x_z
+                q6 = math.atan2(math.cos(q4) * M_21 - math.sin(q4) * M_11, math.cos(q4) * M_11 + math.sin(q4) * M_21)
             else:
-                q4 = np.arctan2(M[2, 0] / s5, M[1, 0] / s5)
-                q6 = np.arctan2(M[0, 2] / s5, -M[0, 1] / s5)
-            q = np.array([q1, q2, q3, q4, q5, q6])
-            for k in (3, 5):
-                q[k] += 2 * np.pi * np.round((near[k] - q[k]) / (2 * np.pi))
-            q = np.where(
-                np.abs(q) > ARM_LIMITS, q - np.sign(q) * 2 * np.pi, q
-            )  # by a whole turn, where that is within the limits
-            if np.any(np.abs(q) > ARM_LIMITS):
+                q4 = math.atan2(M_20 / s5, M_10 / s5)
+                q6 = math.atan2(M_02 / s5, -M_01 / s5)
+            q4, q6 = (q + math.tau * round((n - q) / math.tau) for q, n in ((q4, near[3]), (q6, near[5])))
+            angles = [
+                q - math.copysign(math.tau, q) if abs(q) > limit else q  # by a whole turn, where that is within
+                for q, limit in zip((q1, q2, q3, q4, q5, q6), _LIMITS)
+            ]
+            if any(abs(q) > limit for q, limit in zip(angles, _LIMITS)):
                 continue
-            c = np.sum(np.abs(q - near)[3:]) if q_near is not None else abs(q5 - lateral(side) * 1.3)
-            if c < cost:
-                best, cost = q, c
-        return best
+            if q_near is None:
+                far = abs(q5 - lateral(side) * 1.3)
+            else:
+                far = sum(abs(q - n) for q, n in zip(angles[3:], near[3:]))
+            if far < cost:
+                best, cost = angles, far
+        return None if best is None else np.array(best)
 
     def arm_margin(self, q: np.ndarray) -> float:
         """Distance of an arm pose from singularities and joint limits: 1 is comfortable, 0 at a limit, negative beyond.
 
         Elbow bend within 20..150 deg, wrist bend J5 within 12..118 deg, joints inside their limits.
         """
-        bend, wrist = abs(q[2]), abs(q[4])
-        parts = [
-            (bend - np.deg2rad(20)) / np.deg2rad(25),
-            (np.deg2rad(150) - bend) / np.deg2rad(25),
-            (wrist - np.deg2rad(12)) / np.deg2rad(25),
-            (np.deg2rad(118) - wrist) / np.deg2rad(25),
-            *((ARM_LIMITS - np.abs(q)) / np.deg2rad(40)),
-        ]
-        return float(min(1.0, *parts))
+        angles = [math.degrees(abs(angle)) for angle in q.tolist()]
+        bend, wrist = angles[2], angles[4]
+        inside = min(math.degrees(limit) - angle for limit, angle in zip(_LIMITS, angles))
+        return min(1.0, (bend - 20) / 25, (150 - bend) / 25, (wrist - 12) / 25, (118 - wrist) / 25, inside / 40)
 
 
 def both_arms(left: np.ndarray) -> np.ndarray:

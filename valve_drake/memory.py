@@ -40,18 +40,17 @@ def lock(value: Any, before: Any = None) -> None:
     kind = type(value)
     if kind in _PLAIN:
         return
-    if kind is np.ndarray:
+    if isinstance(value, np.ndarray):
         value.setflags(write=False)
     elif isinstance(value, tuple | list):
         for part in value:
-            lock(part)
+            if type(part) not in _PLAIN:
+                lock(part)
     elif isinstance(value, dict):
         for part in value.values():
             lock(part)
     elif dc.is_dataclass(value) and not isinstance(value, Message | type):
         known = vars(before) if type(before) is kind and before is not value else {}
         for name, part in vars(value).items():
-            if type(part) not in _PLAIN and part is not known.get(name):
+            if type(part) not in _PLAIN and part is not known.get(name) and not isinstance(part, Message):
                 lock(part)
-    elif isinstance(value, np.ndarray):
-        value.setflags(write=False)
