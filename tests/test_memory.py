@@ -31,6 +31,15 @@ def test_what_is_new_in_a_memory_is_locked_and_what_both_share_was():
     assert not any(array.flags.writeable for array in (after.torso, after.velocity, after.goal, after.looks[0][0]))
 
 
+def test_a_row_that_grows_is_locked_by_its_new_end():
+    first, second = np.zeros(2), np.ones(2)
+    before = valve_search.Memory(looks=((first, 0.1),))
+    lock(before)
+    after = changed(before, looks=(*before.looks, (second, 0.2)))
+    lock(after, before)
+    assert not first.flags.writeable and not second.flags.writeable
+
+
 def test_a_memory_that_a_step_wrote_into_is_locked_too():
     @dc.dataclass
     class Careless:

@@ -1,5 +1,6 @@
 """Replay: the recorded station, the comparison, and the command."""
 
+import dataclasses as dc
 import itertools
 import json
 import re
@@ -9,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from log_samples import write_log
+from pydrake.systems.analysis import Simulator
 
-from valve_drake import cli, resources, runner
+from valve_drake import cli, player, resources, runner
 from valve_drake import diagram as wires
 from valve_drake import scenario as scenarios
 from valve_drake.analysis.comparison import Comparison, differences
@@ -452,3 +454,24 @@ def test_differences_name_the_field_and_see_single_bits():
     a, b = (foxglove.log(1.0, "x", text) for text in ("same", "other"))
     assert differences(a, a) == [] and differences(a, b) == [("message", "same", "other")]
     assert [d[0] for d in differences(foxglove.log(1.0, "x", ""), foxglove.log(1.5, "x", ""))] == ["timestamp.nanos"]
+
+
+def test_a_simulator_on_the_recorded_station_comes_to_the_same_bits(log, recording):
+    scenario, _ = runner._recorded_scenario(log)
+    with runner._files_of(log, scenarios.with_overrides(dc.replace(scenario, station="replay"), []), []) as files:
+        comparison = Comparison(log, recording.end)
+        system = wires.make_diagram(files, runner.make_recorder(comparison, files), recording=recording)
+        simulator, requests = Simulator(system.diagram), recording.requests
+        wires.command(system, simulator.get_mutable_context(), requests.values[0])
+        simulator.Initialize()
+        for when, request in zip(requests.times[1:], requests.values[1:]):
+            simulator.AdvanceTo(when - TICK)
+            wires.command(system, simulator.get_mutable_context(), request)
+        simulator.AdvanceTo(recording.end)
+    comparison.finish()
+    assert comparison.identical
+
+
+def test_a_block_whose_times_are_no_slots_is_refused():
+    with pytest.raises(ValueError, match="no multiple of a slot"):
+        player._slots(TICK / 3)

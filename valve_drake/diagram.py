@@ -219,11 +219,22 @@ def make_diagram(
     return System(diagram, station, systems["supervisor"])
 
 
+def recorded_from(name: str) -> str:
+    """The output port that a port of the recorder shows, as "<block>.<port>", or OPERATOR; not for JOINED."""
+    if name == "operator.command":
+        return OPERATOR
+    if name.startswith("truth."):
+        return f"station.{name}"
+    return {spec.name: _OWNER[spec.direction] + name for spec in CONTRACT}.get(name, name)
+
+
+_OWNER = {"out": "station.", "in": "command_selector."}  # of the contract's ports
+
+
 def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems: dict[str, Any], truth: bool) -> None:
     """Every port of the recorder is named after what it records: a station's port, a command, block.port, or JOINED."""
     station = systems["station"]
     exported = {station.get_output_port(k).get_name() for k in range(station.num_output_ports())}
-    commands = {spec.name for spec in CONTRACT if spec.direction == "in"}
 
     def connect(name: str, port: InputPort) -> None:
         if name in JOINED:
@@ -232,15 +243,13 @@ def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems
             for k, part in enumerate(parts):
                 connect(part, join.get_input_port(k))
             builder.Connect(join.get_output_port(), port)
-        elif name == "operator.command":
+            return
+        source = recorded_from(name)
+        if source == OPERATOR:
             builder.ConnectInput(OPERATOR, port)
-        elif name in exported:
-            if truth or not name.startswith("truth."):
-                builder.Connect(station.GetOutputPort(name), port)
-        elif name in commands:
-            builder.Connect(systems["command_selector"].GetOutputPort(name), port)
-        elif not name.startswith("truth."):
-            block, output = name.split(".", 1)
+            return
+        block, output = source.split(".", 1)
+        if not output.startswith("truth.") or (truth and output in exported):
             builder.Connect(systems[block].GetOutputPort(output), port)
 
     for k in range(recorder.num_input_ports()):

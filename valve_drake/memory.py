@@ -35,7 +35,7 @@ def changed(memory: M, **values: Any) -> M:
 def lock(value: Any, before: Any = None) -> None:
     """Makes every array in a memory read-only: in dataclasses, tuples, lists and dicts. Messages lock their own.
 
-    before: the memory that this one replaces, if any: fields that both share are locked already.
+    before: the memory that this one replaces, if any: what both share is locked already.
     """
     kind = type(value)
     if kind in _PLAIN:
@@ -43,14 +43,15 @@ def lock(value: Any, before: Any = None) -> None:
     if isinstance(value, np.ndarray):
         value.setflags(write=False)
     elif isinstance(value, tuple | list):
+        known = {id(part) for part in before} if isinstance(before, tuple) else ()
         for part in value:
-            if type(part) not in _PLAIN:
+            if type(part) not in _PLAIN and id(part) not in known:
                 lock(part)
     elif isinstance(value, dict):
         for part in value.values():
             lock(part)
     elif dc.is_dataclass(value) and not isinstance(value, Message | type):
-        known = vars(before) if type(before) is kind and before is not value else {}
+        fields = vars(before) if type(before) is kind and before is not value else {}
         for name, part in vars(value).items():
-            if type(part) not in _PLAIN and part is not known.get(name) and not isinstance(part, Message):
-                lock(part)
+            if type(part) not in _PLAIN and part is not (last := fields.get(name)) and not isinstance(part, Message):
+                lock(part, last)

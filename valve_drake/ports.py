@@ -37,7 +37,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar, Union
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import Context, InputPort, LeafSystem, State
+from pydrake.systems.framework import Context, LeafSystem, State
 
 from valve_drake import profiling
 from valve_drake.memory import lock
@@ -85,7 +85,7 @@ class Inputs:
             cls.PORTS[name] = kind = _kind(hint)
             setattr(cls, name, _Port(name, kind, cls.__dict__.get(name, _REQUIRED)))
 
-    def __init__(self, sources: "dict[str, _Source]", context: Context):
+    def __init__(self, sources: "Mapping[str, Source]", context: Any):
         self._sources = sources
         self._context = context
 
@@ -113,11 +113,11 @@ class Inputs:
         return value
 
 
-class _Source(NamedTuple):
-    """An input port of a block."""
+class Source(NamedTuple):
+    """Where a block reads an input: a port of Drake's, or of the player's."""
 
-    port: InputPort
-    evaluate: Callable[[Context], Any]  # port.Eval, looked up once
+    port: Any  # of Drake's kind: HasValue, GetFullDescription
+    evaluate: Callable[[Any], Any]  # (Context) or, in the player, (time): the value; looked up once
     kind: type  # of its values; object where Drake checks it
 
 
@@ -161,36 +161,45 @@ class Block(LeafSystem, Generic[In, M]):
         super().__init__()
         self.set_name(name)
         self._name = name
-        self._sources: dict[str, _Source] = {}
+        self.sources: dict[str, Source] = {}
         for port, kind in {**self._inputs.PORTS, **self.INPUTS}.items():
             if isinstance(kind, int):
                 declared = self.DeclareVectorInputPort(port, kind)
             else:
                 model = Value(kind()) if isinstance(kind, type) else kind
                 declared = self.DeclareAbstractInputPort(port, model)
-            self._sources[port] = _Source(declared, declared.Eval, kind if isinstance(kind, type) else object)
-        self._memory = int(self.DeclareAbstractState(Value(_Held(self.initial()))))
+            self.sources[port] = Source(declared, declared.Eval, kind if isinstance(kind, type) else object)
+        self._memory = int(self.DeclareAbstractState(Value(Held(self.initial()))))
         self._held: dict[str, int] = {}  # output port -> index of its state
+        first = self.initial_outputs()
         for port, kind in self.OUTPUTS.items():
             if isinstance(kind, int):
-                index = self.DeclareDiscreteState(kind)
+                index = self.DeclareDiscreteState(first[port])
             elif isinstance(kind, type):
-                index = self.DeclareAbstractState(Value(kind()))
+                index = self.DeclareAbstractState(Value(first[port]))
             else:
                 raise TypeError(f"{name}.{port}: an output is a message class or the size of a vector")
             self._held[port] = int(index)
             self.DeclareStateOutputPort(port, index)
         self.period = period
-        works: list[tuple[int, Step]] = [(slot, self.step)]
+        self.schedule: list[tuple[float, float, Step]] = [
+            (period, slot * SLOT + delay, self.step)
+        ]  # period, offset [s]
         if type(self).later is not Block.later:
-            works.append((3, self.later))
-        for when, work in works:
-            run = functools.partial(self._update, work)
-            self.DeclarePeriodicUnrestrictedUpdateEvent(period, when * SLOT + delay, run)
+            self.schedule.append((period, 3 * SLOT + delay, self.later))
+        for every, offset, work in self.schedule:
+            self.DeclarePeriodicUnrestrictedUpdateEvent(every, offset, functools.partial(self._update, work))
 
     def initial(self) -> M:
         """The memory before the first step; its arrays are locked. A block that keeps none need not write it."""
         return None  # type: ignore[return-value]
+
+    def initial_outputs(self) -> Outputs:
+        """What the outputs hold before the first step: zeros, and messages by default."""
+        return {
+            port: kind() if isinstance(kind, type) else np.zeros(kind) if isinstance(kind, int) else kind
+            for port, kind in self.OUTPUTS.items()
+        }
 
     def step(self, time: float, inputs: In, memory: M) -> tuple[M, Outputs]:
         """One step: new memory, and the outputs that change (those left out keep their value)."""
@@ -202,38 +211,49 @@ class Block(LeafSystem, Generic[In, M]):
 
     def memory(self, context: Context) -> M:
         """The memory in this Context, for tests and reports."""
-        held: _Held = context.get_abstract_state(self._memory).get_value()
+        held: Held = context.get_abstract_state(self._memory).get_value()
         memory: M = held.value
         return memory
 
-    def _update(self, work: "Step", context: Context, state: State) -> None:
-        inputs = self._inputs(self._sources, context)
-        held: _Held = context.get_abstract_state(self._memory).get_value()
+    def update(
+        self, work: "Step", time: float, sources: "Mapping[str, Source]", where: Any, held: "Held"
+    ) -> "tuple[Held, Outputs] | None":
+        """One step, `step` or `later`, on the ports `sources` evaluated in `where`; None while the block sleeps."""
+        inputs = self._inputs(sources, where)
         activation = None
         if self.AWAKE is not None:
             mode = inputs.read("mode", _REQUIRED)
             if mode.mode not in self.AWAKE:
                 activation = mode.activation
                 if held.asleep == activation:
-                    return
+                    return None
         with profiling.work(profiling.STAGE, self._name):
-            memory, outputs = work(context.get_time(), inputs, held.value)
-        abstract = state.get_mutable_abstract_state()
-        abstract.get_mutable_value(self._memory).set_value(_Held(memory, activation, held.value))
+            memory, outputs = work(time, inputs, held.value)
         for port, value in outputs.items():
             kind = self.OUTPUTS[port]
-            if isinstance(kind, int):
-                state.get_mutable_discrete_state(self._held[port]).SetFromVector(np.asarray(value, float))
-            elif isinstance(kind, type) and isinstance(value, kind):
-                abstract.get_mutable_value(self._held[port]).set_value(value)
-            else:
+            if isinstance(kind, type) and not isinstance(value, kind):
                 raise TypeError(f"{self.get_name()}.{port}: want {kind}, got {type(value).__name__}")
+        return Held(memory, activation, held.value), outputs
+
+    def _update(self, work: "Step", context: Context, state: State) -> None:
+        held: Held = context.get_abstract_state(self._memory).get_value()
+        updated = self.update(work, context.get_time(), self.sources, context, held)
+        if updated is None:
+            return
+        held, outputs = updated
+        abstract = state.get_mutable_abstract_state()
+        abstract.get_mutable_value(self._memory).set_value(held)
+        for port, value in outputs.items():
+            if isinstance(self.OUTPUTS[port], int):
+                state.get_mutable_discrete_state(self._held[port]).SetFromVector(np.asarray(value, float))
+            else:
+                abstract.get_mutable_value(self._held[port]).set_value(value)
 
 
 Step = Callable[[float, Any, Any], tuple[Any, Outputs]]
 
 
-class _Held:
+class Held:
     """Carries a block's memory through Drake's state copies without copying it; its arrays are locked.
 
     before: the memory that this one replaces.
@@ -246,5 +266,5 @@ class _Held:
         self.value = value
         self.asleep = asleep  # the activation of a mode that has had its one step; None: awake
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "_Held":
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Held":
         return self

@@ -32,6 +32,7 @@ from valve_drake.config import key_names
 from valve_drake.diagram import System, command, make_diagram, rig_of
 from valve_drake.messages import Mode, ModeState, OperatorCommand, Verdict
 from valve_drake.pace import PACE, Pace, Pacer
+from valve_drake.player import Player
 from valve_drake.ports import SLOT, TICK
 from valve_drake.recording import layout
 from valve_drake.recording.reader import LogReader
@@ -475,9 +476,9 @@ def replay(
                 say(writer.note)
             _begin_log(writer, scenario, data, replay_of=log.path.name)
             sink = Tee(comparison, writer)
-        system = make_diagram(files, make_recorder(sink, files), recording=recording)
+        player = Player(files, recording, make_recorder(sink, files))
         begin = time.perf_counter()
-        mode = _feed(system, Simulator(system.diagram), recording, show, begin)
+        mode = _feed(player, recording, show, begin)
         comparison.finish()
         wall = time.perf_counter() - begin
         if writer is not None:
@@ -521,27 +522,22 @@ def _files_of(log: LogReader, scenario: Scenario, changed: Collection[str]) -> I
         yield dc.replace(scenario, **files)
 
 
-def _feed(
-    system: System, simulator: Simulator, recording: Recording, show: Callable[[Progress], None], begin: float
-) -> ModeState:
-    """Advances to the recording's end; the operator asks when he did in the run (stations/replay.py)."""
-    context = simulator.get_mutable_context()
-    port = system.supervisor.GetOutputPort("mode")
-    inner = system.supervisor.GetMyContextFromRoot(context)
+def _feed(player: Player, recording: Recording, show: Callable[[Progress], None], begin: float) -> ModeState:
+    """Plays to the recording's end; the operator asks when he did in the run (stations/replay.py)."""
 
     def advance(until: float) -> None:
-        while (now := context.get_time()) < until:
-            simulator.AdvanceTo(min(now + STEP, until))
-            show(Progress(port.Eval(inner), context.get_time(), time.perf_counter() - begin))
+        while player.time < until:
+            player.advance(min(player.time + STEP, until))
+            show(Progress(player.mode, player.time, time.perf_counter() - begin))
 
     requests = list(zip(recording.requests.times, recording.requests.values))
-    command(system, context, requests[0][1])
-    simulator.Initialize()
+    player.command(requests[0][1])
+    player.begin()
     for when, request in requests[1:]:
         advance(min(when - TICK, recording.end))
-        command(system, context, request)
+        player.command(request)
     advance(recording.end)
-    return port.Eval(inner)
+    return player.mode
 
 
 def _notes(log: LogReader, recorded: Scenario, recording: Recording, changed: Collection[str]) -> list[str]:

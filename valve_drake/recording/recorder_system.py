@@ -92,16 +92,24 @@ class RecorderSystem(LeafSystem):
             raise ValueError(f"port {name} is {self._ports[name].kind} in one row and {kind} in another")
         return self._ports[name]
 
+    def listen(self, source: Callable[[str], Callable[[float], Any] | None]) -> None:
+        """Reads what `source`(port) reads at a time instead of Drake's ports; None stands for unconnected."""
+        for name, port in self._ports.items():
+            port.listen(source(name))
+
     def _publish(self, context: Context) -> None:
+        self.record(context.get_time(), context)
+
+    def record(self, time: float, where: Any) -> None:
+        """Writes what is due at `time`, with the ports evaluated in `where`: a Context, or the time itself."""
         with profiling.work(profiling.LOGGING):
             if not self._begun:
                 self._begun = True
-                self._rows = [row for row in self._rows if all(port.connected(context) for port in row.ports)]
-            time = context.get_time()
+                self._rows = [row for row in self._rows if all(port.connected(where) for port in row.ports)]
             tick = round(time / TICK)
             rows, ports = self._due(*(tick % every == 0 for every in self._periods))
             for port in ports:
-                port.read(context)
+                port.read(where)
             for row in rows:
                 if row.watched and row.watched.value is row.seen:
                     continue  # the usual case: tested here, since a call for each row would cost more
@@ -129,13 +137,17 @@ class _Port:
         self.kind = kind
         self.value: Any = None
         self._port = port
+        self._evaluate: Callable[[Any], Any] = port.Eval
+        self.connected: Callable[[Any], bool] = port.HasValue
         self._type = np.ndarray if isinstance(kind, int) else kind
 
-    def connected(self, context: Context) -> bool:
-        return self._port.HasValue(context)
+    def listen(self, source: Callable[[float], Any] | None) -> None:
+        self.connected = lambda time: source is not None
+        if source is not None:
+            self._evaluate = source
 
-    def read(self, context: Context) -> None:
-        self.value = self._port.Eval(context)
+    def read(self, where: Any) -> None:
+        self.value = self._evaluate(where)
         if not isinstance(self.value, self._type):
             # Connect() cannot check this: Drake sees every Python message as Value[object].
             found = type(self.value).__name__

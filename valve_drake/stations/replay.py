@@ -33,7 +33,7 @@ from valve_drake.recording.foxglove import NANO, nanoseconds
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.signals import FRAMES, MEASURED, topic_of
 from valve_drake.stations.camera_rig import decode_image
-from valve_drake.stations.contract import CAMERAS, CONTRACT, station_of
+from valve_drake.stations.contract import CAMERAS, CONTRACT, PortSpec, station_of
 
 JOINTS, HEALTH, OPERATOR = "/joint_states", "/health", "/operator/command"
 WRENCHES = {f"/{side}_wrist/wrench": f"{side}_wrist.wrench" for side in SIDES}
@@ -146,32 +146,39 @@ class RecordedStation(LeafSystem):
     def __init__(self, recording: Recording):
         super().__init__()
         self.set_name("recorded_station")
-        self._frame = functools.lru_cache(maxsize=len(CAMERAS))(recording.frame)
+        ports = shown(recording)
         for spec in CONTRACT:
             if spec.direction == "in":
                 self.DeclareVectorInputPort(spec.name, spec.kind)
                 continue
-            track = recording.tracks[spec.name]
-            when = {self.time_ticket()}
+            read, when = ports[spec.name], {self.time_ticket()}
             if isinstance(spec.kind, int):
-                self.DeclareVectorOutputPort(spec.name, spec.kind, _vector(track), when)
+                self.DeclareVectorOutputPort(spec.name, spec.kind, _vector(read), when)
             else:
-                calc = self._image(track) if spec.kind is CameraFrame else _message(track)
-                self.DeclareAbstractOutputPort(spec.name, functools.partial(Value, spec.kind()), calc, when)
-
-    def _image(self, track: Track) -> Callable[[Context, Value], None]:
-        def calc(context: Context, output: Value) -> None:
-            output.set_value(self._frame(*track.at(_next_tick(context.get_time()))))
-
-        return calc
+                self.DeclareAbstractOutputPort(spec.name, functools.partial(Value, spec.kind()), _message(read), when)
 
 
-def _vector(track: Track) -> Callable[[Context, BasicVector], None]:
-    return lambda context, output: output.SetFromVector(track.at(context.get_time()))
+def _vector(read: Callable[[float], Any]) -> Callable[[Context, BasicVector], None]:
+    return lambda context, output: output.SetFromVector(read(context.get_time()))
 
 
-def _message(track: Track) -> Callable[[Context, Value], None]:
-    return lambda context, output: output.set_value(track.at(_next_tick(context.get_time())))
+def _message(read: Callable[[float], Any]) -> Callable[[Context, Value], None]:
+    return lambda context, output: output.set_value(read(context.get_time()))
+
+
+def shown(recording: Recording) -> dict[str, Callable[[float], Any]]:
+    """What each output port of the contract shows at a time [s] (see the top of this file)."""
+    frame = functools.lru_cache(maxsize=len(CAMERAS))(recording.frame)
+
+    def reader(spec: PortSpec) -> Callable[[float], Any]:
+        at = recording.tracks[spec.name].at
+        if isinstance(spec.kind, int):
+            return at
+        if spec.kind is CameraFrame:
+            return lambda time: frame(*at(_next_tick(time)))
+        return lambda time: at(_next_tick(time))
+
+    return {spec.name: reader(spec) for spec in CONTRACT if spec.direction == "out"}
 
 
 def _next_tick(time: float) -> float:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from pydrake.systems.framework import Context, State
 
 from valve_drake.messages import Command, Health, ModeState, RobotState, SelectorReport
 from valve_drake.ports import Block, Inputs, Outputs
@@ -57,15 +56,12 @@ class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
         self.config = config
         self._start = start(config, initial)
         super().__init__(name, slot=2)
-        self.DeclareInitializationUnrestrictedUpdateEvent(self._hold_initial)
 
     def initial(self) -> Memory:
         return self._start
 
-    def _hold_initial(self, context: Context, state: State) -> None:
-        # The plant reads the ports before the first step; a simulator that is initialised again changes nothing.
-        for port, value in outputs(self.memory(context)).items():
-            state.get_mutable_discrete_state(self._held[port]).SetFromVector(value)
+    def initial_outputs(self) -> Outputs:
+        return super().initial_outputs() | outputs(self._start)  # the plant reads the ports before the first step
 
     def step(self, time: float, inputs: CommandSelectorInputs, memory: Memory) -> tuple[Memory, Outputs]:
         commands = {name: inputs[name] for name in BEHAVIORS}

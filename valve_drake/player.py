@@ -1,0 +1,145 @@
+"""Steps the program's blocks on a recording, in the order in which Drake steps them, without a simulator.
+
+A block is a pure step at fixed times (ports.py), so that nothing is left of a simulation when its inputs are a
+recording: no plant, no integrator, no copies of a Context. Blocks, wires and the recorder are those of diagram.py; that
+both come to the same bits is what a replay shows, whose log Drake has written.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from valve_drake.diagram import OPERATOR, WIRES, make_blocks, recorded_from
+from valve_drake.messages import ModeState, OperatorCommand
+from valve_drake.ports import SLOT, TICK, Block, Held, Source, Step
+from valve_drake.recording.recorder_system import RecorderSystem
+from valve_drake.recording.signals import JOINED
+from valve_drake.scenario import Scenario
+from valve_drake.stations.replay import Recording, shown
+
+Read = Callable[[float], Any]  # time [s] -> value
+
+
+_SLOTS = round(TICK / SLOT)  # of a tick
+
+
+class _Played:
+    """A block with its memory, its wired inputs and its times."""
+
+    def __init__(self, block: Block[Any, Any]):
+        self.block = block
+        self.held = Held(block.initial())
+        self.sources: dict[str, Source] = {}
+        # Every `period` slots from slot `offset` on: work.
+        self.works = [(_slots(period), _slots(offset), work) for period, offset, work in block.schedule]
+
+
+class Player:
+    """The blocks of a resolved scenario on a recording; `recorder` writes what comes out.
+
+    time: up to where it was played [s].
+    """
+
+    def __init__(self, scenario: Scenario, recording: Recording, recorder: RecorderSystem):
+        self._recorder = recorder
+        self._slot = 0  # the next one whose updates are due
+        self._values: dict[str, Any] = {"supervisor.operator": OperatorCommand()}  # what ports hold, by block.port
+        self._station = shown(recording)
+        blocks = [_Played(block) for block in make_blocks(scenario)]
+        for played in blocks:
+            for port, value in played.block.initial_outputs().items():
+                self._values[f"{played.block.get_name()}.{port}"] = value
+        wires = {target: source for source, target in WIRES} | {"supervisor.operator": "supervisor.operator"}
+        for played in blocks:
+            name = played.block.get_name()
+            for port, declared in played.block.sources.items():
+                played.sources[port] = Source(_Wired(), self._read(wires[f"{name}.{port}"]), declared.kind)
+        recorder.listen(self._recorded)
+        self._blocks = blocks
+        cycle = math.lcm(*(period for played in blocks for period, _, _ in played.works))
+        # Which works are due in each slot of a cycle; `offset` is when a work is due first.
+        self._due: list[list[tuple[_Played, int, Step]]] = [
+            [
+                (played, offset, work)
+                for played in blocks
+                for period, offset, work in played.works
+                if (slot - offset) % period == 0
+            ]
+            for slot in range(cycle)
+        ]
+
+    @property
+    def time(self) -> float:
+        return self._slot * SLOT
+
+    @property
+    def mode(self) -> ModeState:
+        mode: ModeState = self._values["supervisor.mode"]
+        return mode
+
+    def command(self, request: OperatorCommand) -> None:
+        """The operator's request, from now on."""
+        self._values["supervisor.operator"] = request
+
+    def begin(self) -> None:
+        """Records what is there at 0."""
+        self._recorder.record(0.0, 0.0)
+
+    def advance(self, until: float) -> None:
+        """Plays on to a tick. As in a simulation it is recorded at its end, and updated when the play goes on."""
+        while (time := self.time) < until:
+            for played, outputs in self._update(time):
+                for port, value in outputs.items():
+                    self._values[f"{played.block.get_name()}.{port}"] = value
+            self._slot += 1
+            if self._slot % _SLOTS == 0:
+                self._recorder.record(self.time, self.time)
+
+    def _update(self, time: float) -> list[tuple[_Played, dict[str, Any]]]:
+        """All that is due now; each reads what was there before."""
+        done = []
+        for played, offset, work in self._due[self._slot % len(self._due)]:
+            if self._slot < offset:
+                continue
+            updated = played.block.update(work, time, played.sources, time, played.held)
+            if updated is not None:
+                played.held, outputs = updated
+                done.append((played, outputs))
+        return done
+
+    def _read(self, source: str) -> Read:
+        """What an output port holds: "station.<port>" or "<block>.<port>"."""
+        block, port = source.split(".", 1)
+        if block == "station":
+            return self._station[port]
+        return lambda time: self._values[source]
+
+    def _recorded(self, name: str) -> Read | None:
+        """What a port of the recorder shows; None if that is not in a recording."""
+        if name in JOINED:
+            parts = [self._read(recorded_from(part)) for part in JOINED[name]]
+            return lambda time: np.concatenate([part(time) for part in parts])
+        source = recorded_from(name)
+        if source == OPERATOR:
+            return self._read("supervisor.operator")
+        return None if source.startswith("station.truth.") else self._read(source)
+
+
+class _Wired:
+    """Stands for an input port that leads to another block."""
+
+    def HasValue(self, context: Any) -> bool:
+        return True
+
+    def GetFullDescription(self) -> str:
+        return "an input port"
+
+
+def _slots(seconds: float) -> int:
+    """A time as a number of slots; ports.py's are all multiples of one."""
+    count = round(seconds / SLOT)
+    if count * SLOT != seconds:
+        raise ValueError(f"{seconds} s is no multiple of a slot of {SLOT} s")
+    return count
