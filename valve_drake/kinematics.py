@@ -15,6 +15,7 @@ Frames: frames.py. The numbers below are those of models/robot/robot.sdf; a test
 """
 
 import dataclasses as dc
+import functools
 import math
 
 import numpy as np
@@ -23,6 +24,7 @@ from valve_drake.frames import compose, cross, make, planar, rot_x, rot_y, rot_z
 from valve_drake.messages import LEFT, RIGHT
 
 ARM_LIMITS = np.array([2.97, 2.09, 2.62, 3.32, 2.09, 3.14])  # +- [rad]
+_AT_ORIGIN = np.zeros(3)
 _LIMITS = tuple(ARM_LIMITS.tolist())
 MIRROR = np.array([1.0, -1, -1, -1, -1, -1])  # left arm to right arm: all axes but the lateral J1 change sign
 R_G0 = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # R_HG at zero: x_G = y_H, y_G = z_H, z_G = x_H
@@ -48,16 +50,16 @@ class RobotGeometry:
     def X_BL(self, torso: np.ndarray) -> np.ndarray:
         """Left head camera in the base for torso = (waist twist, neck pitch, neck yaw) -> (3, 4)."""
         waist, pitch, yaw = torso
+        to_yaw, to_pitch, to_eye = self._head_links
+        return compose(make(rot_z(waist), _AT_ORIGIN), make(rot_z(yaw), to_yaw), make(rot_y(pitch), to_pitch), to_eye)
+
+    @functools.cached_property
+    def _head_links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """From the waist to the neck's yaw axis (3,), on to its pitch axis (3,), and on to the left eye (3, 4)."""
         to_yaw = np.array(self.neck_yaw)
         to_pitch = np.array(self.neck_pitch) - to_yaw
         to_eye = np.array(self.eye_left) - np.array(self.neck_pitch)
-        optical = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-        return compose(
-            make(rot_z(waist), np.zeros(3)),
-            make(rot_z(yaw), to_yaw),
-            make(rot_y(pitch), to_pitch),
-            make(optical, to_eye),
-        )
+        return to_yaw, to_pitch, make(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), to_eye)
 
     def head_pose(self, base: np.ndarray, torso: np.ndarray) -> np.ndarray:
         """X_OL for base = (x, y, heading) in O -> (3, 4)."""

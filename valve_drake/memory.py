@@ -48,9 +48,12 @@ def lock(value: Any, before: Any = None) -> None:
             if type(part) not in _PLAIN and id(part) not in known:
                 lock(part)
     elif isinstance(value, dict):
-        for part in value.values():
-            lock(part)
+        former = before if isinstance(before, dict) else {}
+        for name, part in value.items():
+            lock(part, former.get(name))
     elif dc.is_dataclass(value) and not isinstance(value, Message | type):
+        if value is before and kind.__dataclass_params__.frozen:
+            return
         fields = vars(before) if type(before) is kind and before is not value else {}
         for name, part in vars(value).items():
             if type(part) not in _PLAIN and part is not (last := fields.get(name)) and not isinstance(part, Message):
