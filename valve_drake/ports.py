@@ -16,7 +16,7 @@ can be cloned, replayed and tested alone.
         def step(self, time: float, inputs: GreeterInputs, memory: Memory) -> tuple[Memory, Outputs]: ...
 
 Time inside one control tick of 1/128 s is cut into four slots of 1/512 s, so that a measurement reaches the joints
-within one tick and no two blocks that feed each other run at the same instant:
+after one tick and no two blocks that feed each other run at the same instant:
 
     slot 0  robot_state (measurements are gathered)
     slot 1  behaviours
