@@ -495,6 +495,7 @@ def test_a_run_that_loses_its_way_within_all_deadlines_of_its_modes_ends_as_a_ti
     while bench.state.mode not in TERMINAL:
         bench.tick()
         bench.state = dc.replace(bench.state, since=bench.time)
+        assert bench.time < 2 * CONFIG.run_deadline, "it goes on for ever"
     assert bench.state.verdict == Verdict.TIMEOUT and "the run took more than" in bench.state.reason
     assert bench.time == pytest.approx(CONFIG.run_deadline + CONFIG.turn_allowance * OPEN.angle, abs=1.0)
 
