@@ -373,16 +373,6 @@ def test_retreat_goes_straight_back_half_a_metre():
     assert np.max(np.abs(run.twists[:, 0])) <= CONFIG.retreat_speed + 1e-12
 
 
-def test_retreat_waits_for_the_arms_but_not_for_ever():
-    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(2))
-    run = drive(Mode.RETREAT, Wheels(scene.stance()), scene, arms=lambda t: 0.4 if t < 3 else 0.0)
-    moving = np.abs(run.twists[:, 0]) > 0
-    assert np.argmax(moving) * DT == pytest.approx(3 + CONFIG.arms_wait, abs=0.05)
-    run = drive(Mode.RETREAT, Wheels(scene.stance()), scene, arms=lambda t: 0.4)
-    assert run.status.state == "succeeded"
-    assert np.argmax(np.abs(run.twists[:, 0]) > 0) * DT == pytest.approx(CONFIG.arms_patience, abs=0.05)
-
-
 # ---------------------------------------------------------------- shape of the behaviour
 
 

@@ -12,10 +12,8 @@ from valve_drake.kinematics import ARM_LIMITS
 from valve_drake.messages import Command, Health, Mode, ModeState, RobotState, SelectorReport, Verdict
 from valve_drake.motion import braking_speed, follow
 from valve_drake.supervisor.command_selector import (
-    BEHAVIORS,
     GRIPPERS,
     GROUPS,
-    HOLD,
     JOINTS,
     PORTS,
     SOURCE,
@@ -26,6 +24,7 @@ from valve_drake.supervisor.command_selector import (
     step,
 )
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
+from valve_drake.task.modes import BEHAVIORS, TABLE
 
 DT = 1 / 128
 CONFIG = CommandSelectorConfig()
@@ -596,7 +595,6 @@ def test_whoever_commands_a_group_in_a_mode_is_awake_in_it():
     from valve_drake.behaviors.image_servo_system import ImageServoSystem
     from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
     from valve_drake.behaviors.valve_search_system import ValveSearchSystem
-    from valve_drake.supervisor.supervisor import OWNER
 
     awake = {
         "valve_search": ValveSearchSystem.AWAKE,
@@ -606,5 +604,5 @@ def test_whoever_commands_a_group_in_a_mode_is_awake_in_it():
         "hybrid_rotation": HybridRotationSystem.AWAKE,
     }
     for mode, row in SOURCE.items():
-        for block in {*row.values(), OWNER.get(mode, HOLD)} & set(awake):
+        for block in {*row.values(), TABLE[mode].owner} & set(awake):
             assert awake[block] is None or mode in awake[block], f"{block} in {mode}"

@@ -106,10 +106,10 @@ def frame(image, k):
     return CameraFrame(time=k / 16, sequence=k, image=image)
 
 
-def rig(mode="servo"):
+def rig(every=1):
     rng = np.random.default_rng(0)
     left, right = wrist_image(facing(0.2, 0.2), rng), wrist_image(facing(0.3, -0.2), rng)
-    dut = Rig(HandleMarkerSystem(CONFIG), mode=ModeState(mode=mode))
+    dut = Rig(HandleMarkerSystem(CONFIG), mode=ModeState(wrist_every=every))
     dut.fix(left_wrist_image=frame(left, 0), right_wrist_image=frame(right, 0))
     return dut, left, right
 
@@ -138,21 +138,21 @@ def test_block_looks_at_both_hands_and_holds():
 
 
 def test_block_reads_no_image_in_modes_that_need_none():
-    dut, *_ = rig("search")
+    dut, *_ = rig(every=0)
     dut.fix(left_wrist_image=ModeState())  # reading it would raise
     assert dut.run(0.3).read("marks").left.sequence == -1
 
 
 def test_block_works_with_one_camera():
     _, left, _ = rig()
-    dut = Rig(HandleMarkerSystem(CONFIG), mode=ModeState(mode="reach"), left_wrist_image=frame(left, 0))
+    dut = Rig(HandleMarkerSystem(CONFIG), mode=ModeState(wrist_every=1), left_wrist_image=frame(left, 0))
     marks = dut.run(0.1).read("marks")
     assert marks.left.found and not marks.right.found
 
 
 @pytest.mark.parametrize(
     ("bad", "key"),
-    [({"min_fill": 0.0}, "min_fill"), ({"every": {"servo": 0.5}}, "every.servo"), ({"max_aspect": 0.5}, "max_aspect")],
+    [({"min_fill": 0.0}, "min_fill"), ({"max_aspect": 0.5}, "max_aspect")],
 )
 def test_bad_config_is_refused(bad, key):
     with pytest.raises(ConfigError, match=f"handle_marker.{key}"):

@@ -46,8 +46,8 @@ from valve_drake.stations.hardware import RobotLink, make_hardware_station
 from valve_drake.stations.replay import Recording, make_replay_station
 from valve_drake.stations.simulated import make_simulated_station, rig_arguments
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
-from valve_drake.supervisor.supervisor import BEHAVIORS
 from valve_drake.supervisor.supervisor_system import SupervisorSystem
+from valve_drake.task.modes import BEHAVIORS
 
 WIRES: tuple[tuple[str, str], ...] = (
     # head cameras: stages 1 and 2

@@ -281,11 +281,19 @@ class Mode(enum.StrEnum):
     GRASP = "grasp"
     TURN = "turn"
     RELEASE = "release"
+    FOLD = "fold"
     VERIFY = "verify"
     RETREAT = "retreat"
     DONE = "done"
     FAILED = "failed"
     STOPPED = "stopped"
+
+
+class Cause(enum.StrEnum):
+    """What a behaviour found where the verdict alone does not say what to try next; NONE: nothing more to say."""
+
+    NONE = ""
+    STANCE = "stance"  # the arms would reach from another place
 
 
 class Verdict(enum.StrEnum):
@@ -328,6 +336,9 @@ class ModeState(Message):
     turn_angle: float = 0.0  # commanded turn, positive opens (counter-clockwise seen from the robot) [rad]
     verdict: str = Verdict.NONE.value
     reason: str = ""
+    head_every: int = 0  # perception looks at every n-th pair of the head's images; 0: at none
+    wrist_every: int = 0  # the same of the wrists' images
+    afresh: bool = False  # it forgets what it followed from image to image
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -341,6 +352,8 @@ class Status(Message):
     detail: str = ""  # one line for people
     progress: float = 0.0  # 0..1
     value: float = 0.0  # the turned angle, in turn and verify [rad]
+    seen: bool = False  # of verify: `value` is what the camera saw
+    cause: str = Cause.NONE.value  # beside the verdict: what decides what is tried next
 
 
 @dc.dataclass(frozen=True, eq=False)

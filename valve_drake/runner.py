@@ -55,11 +55,11 @@ from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.hardware import AHEAD, RobotLink
 from valve_drake.stations.replay import Recording
+from valve_drake.task.modes import TERMINAL
 
 STEP = 1 / 32  # between two looks at the mode [s]
 TAIL = 1.5  # recorded after the end: a stopped base takes a second to stand [s]
 VIEW_PORT = 7000  # that Drake's 3D view tries first
-TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
 READERS = {"head_calibration": load_head, "taught": load_taught}  # of the files that a scenario names
 FILES = {key: f"{key}.yaml" for key in READERS}  # the same, as attached to its log
 WORLD = ("simulation", "hardware", "faults")

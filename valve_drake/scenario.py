@@ -38,7 +38,12 @@ DEFAULT = "simulated.scenario.yaml"
 # Keys of older versions: a log that has them can still be replayed.
 RETIRED = (
     "base_approach.panel_behind",
+    "base_approach.arms_still",
+    "base_approach.arms_wait",
+    "base_approach.arms_patience",
     "command_selector.arm_limit",
+    "color_segmentation.every",
+    "handle_marker.every",
     "handle_marker.lines.single_camera",
     *(
         f"handle_marker.segmentation.{name}"

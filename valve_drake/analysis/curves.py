@@ -12,6 +12,7 @@ from valve_drake.analysis.plots import Line, Plot
 from valve_drake.analysis.traces import ARMS, Traces
 from valve_drake.messages import SIDES, Mode
 from valve_drake.recording.signals import TORSO
+from valve_drake.task.modes import RUNNING, owned
 
 BLUE, ORANGE, GREEN, BLACK, GREY = "#0b62a8", "#d1500c", "#157f4c", "#1b1b1b", "#8a8f98"
 PURPLE, RED = "#7a3fa0", "#c1272d"
@@ -157,7 +158,7 @@ def _angle(log: Traces) -> Plot:
     if log.truth is not None:
         lines.append(Line("true", log.truth.time, scale * log.truth.angle, GREY))
     if log.turn is not None:
-        working = log.inside(log.turn["time"], Mode.GRASP, Mode.TURN, Mode.RELEASE)
+        working = log.inside(log.turn["time"], *owned("hybrid_rotation"))
         t = log.turn["time"][working]
         lines.append(Line("reference", t, scale * log.turn["angle_reference"][working], BLACK, dashed=True))
         lines.append(Line("by the hands", t, scale * log.turn["angle"][working], ORANGE))
@@ -179,9 +180,7 @@ def _angle_difference(log: Traces) -> Plot:
             lines.append(Line("by the hands", t, scale * off, ORANGE))
         if log.camera_angle is not None:
             time, angle = log.camera_angle
-            seen = log.inside(
-                time, Mode.MEASURE, Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE, Mode.VERIFY
-            )
+            seen = log.inside(time, *RUNNING[RUNNING.index(Mode.MEASURE) : RUNNING.index(Mode.RETREAT)])
             off = (angle - np.interp(time, truth.time, truth.angle))[seen]
             lines.append(Line("by the head cameras", time[seen], scale * off, BLUE, "dots"))
     return Plot(

@@ -10,7 +10,7 @@ from valve_drake.analysis.traces import ARMS, Estimates, ModeSpan, Traces
 from valve_drake.messages import SIDES, Mode
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.signals import TORSO
-from valve_drake.supervisor.supervisor import TERMINAL
+from valve_drake.task.modes import TERMINAL
 
 LOADED = 1.0  # below this couple the hands' shares are noise and are left out [N m]
 

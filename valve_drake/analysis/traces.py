@@ -355,7 +355,7 @@ class Traces:
         verifying = {span.activation for span in self.spans if span.mode == Mode.VERIFY}
         angle = None
         for _, status in self._messages("/kinematic_approach/status"):
-            if status.activation in verifying and status.state in ("succeeded", "failed") and status.progress == 1.0:
+            if status.activation in verifying and status.seen:
                 angle = status.value
         return angle
 

@@ -41,8 +41,9 @@ from valve_drake.messages import (
 )
 from valve_drake.motion import slew, towards
 from valve_drake.perception.marker import Marker
+from valve_drake.task.modes import owned
 
-MODES = (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.RETREAT)
+MODES = owned("base_approach")
 
 
 @dc.dataclass
@@ -86,9 +87,6 @@ class BaseApproachConfig(Config):
     stance_patience: float = number(5.0, 0.5, 60.0, "waits so long for a first stance [s]")
     retreat_distance: float = number(0.5, 0.05, 2.0, "straight back from the stance [m]")
     retreat_speed: float = number(0.2, 0.02, 0.5, "[m/s]")
-    arms_still: float = number(0.05, 0.005, 0.5, "arms with slower joints are at rest [rad/s]")
-    arms_wait: float = number(0.5, 0.05, 10.0, "it retreats when the arms have been at rest for so long [s]")
-    arms_patience: float = number(6.0, 0.5, 60.0, "it retreats after this in any case [s]")
 
     def relations(self, key: str) -> None:
         below = self.rough_stop < self.rough_distance
@@ -424,13 +422,6 @@ def _retreat(
     x, y, heading = state.odometry[:3]
     c, s = np.cos(m.start[2]), np.sin(m.start[2])
     back = float(c * (m.start[0] - x) + s * (m.start[1] - y))
-    if m.phase == "plan":
-        speed = max(np.max(np.abs(state.left_arm_velocity)), np.max(np.abs(state.right_arm_velocity)))
-        if speed > config.arms_still:
-            m = changed(m, quiet_since=time)
-        if time - m.quiet_since < config.arms_wait and time - m.since < config.arms_patience:
-            return changed(m, detail="waiting for the arms"), np.zeros(2)
-        m = changed(m, phase="back")
     left = config.retreat_distance - back
     m = changed(m, detail=f"{back:.2f} m back", progress=float(np.clip(back / config.retreat_distance, 0, 1)))
     if left < 0.01 and _still(config, state):

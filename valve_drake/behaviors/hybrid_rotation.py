@@ -46,9 +46,10 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.perception.marker import Marker
+from valve_drake.task.modes import owned
 
 GRAVITY = 9.81
-AT_VALVE = (Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE)  # the wrist sensors are tared or filtered
+AT_VALVE = (Mode.REACH, Mode.SERVO, *owned("hybrid_rotation"))  # the wrist sensors are tared or filtered
 
 
 @dc.dataclass

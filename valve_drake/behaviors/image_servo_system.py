@@ -1,8 +1,9 @@
 """Block `image_servo`: stage 4 on ports. No mathematics here."""
 
 from valve_drake.behaviors.image_servo import ImageServo, Memory
-from valve_drake.messages import Command, HandleMarks, Mode, ModeState, RobotState, ServoState, Status
+from valve_drake.messages import Command, HandleMarks, ModeState, RobotState, ServoState, Status
 from valve_drake.ports import TICK, Block, Inputs, Outputs
+from valve_drake.task.modes import owned
 
 
 class ImageServoInputs(Inputs):
@@ -24,7 +25,7 @@ class ImageServoSystem(Block[ImageServoInputs, Memory]):
     servo        out  ServoState   telemetry
     """
 
-    AWAKE = frozenset((Mode.SERVO,))
+    AWAKE = frozenset(owned("image_servo"))
     OUTPUTS = {"command": Command, "status": Status, "servo": ServoState}
 
     def __init__(self, law: ImageServo, name: str = "image_servo"):

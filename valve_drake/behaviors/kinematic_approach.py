@@ -5,7 +5,8 @@ In each mode:
     measure   several frames at rest -> the valve's pose in the base and the grasps (GraspPlan)
     reach     a collision-free joint path of both arms to the stand-off before the handles, offset along the wrist
               cameras' view; ends on arrival, or before when both green marks are large enough in the wrist images
-    verify    arms back home, several frames at rest: the angle that the camera measures decides
+    fold      both arms home along a collision-free path
+    verify    several frames at rest: the angle that the camera measures decides
     retreat   holds home
 
 Frames: frames.py. The base stands still from measure to verify.
@@ -35,6 +36,7 @@ from valve_drake.messages import (
     LEFT,
     RIGHT,
     SIDES,
+    Cause,
     Command,
     GraspPlan,
     HandleMarks,
@@ -49,6 +51,7 @@ from valve_drake.messages import (
 )
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import fuse
+from valve_drake.task.modes import TABLE
 
 
 @dc.dataclass
@@ -103,7 +106,7 @@ class Memory:
 
 
 # Modes in which another block moves the arms; on return the commands start from the measured joints.
-NOT_OWNED = (Mode.SERVO, Mode.GRASP, Mode.TURN, Mode.RELEASE, Mode.DONE, Mode.FAILED, Mode.STOPPED)
+NOT_OWNED = tuple(mode for mode, row in TABLE.items() if row.hands != "kinematic_approach")
 NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms [m]
 
 
@@ -159,7 +162,12 @@ class KinematicApproach:
             m = changed(m, q=measured, path=None)
         if mode.mode in NOT_OWNED:
             return m, Command(time=time)
-        run = {Mode.MEASURE: self._measure, Mode.REACH: self._reach, Mode.VERIFY: self._verify}
+        run = {
+            Mode.MEASURE: self._measure,
+            Mode.REACH: self._reach,
+            Mode.FOLD: self._fold,
+            Mode.VERIFY: self._verify,
+        }
         if mode.mode in run:
             m = run[Mode(mode.mode)](time, m, state, mode, estimate, marks, turn)
         else:
@@ -171,8 +179,10 @@ class KinematicApproach:
         gripper = np.array([self.config.opening, self.config.gripper_force])
         return m, Command(time=time, left_arm=m.q[:6], right_arm=m.q[6:], left_gripper=gripper, right_gripper=gripper)
 
-    def _status(self, m: Memory, time: float, state: str, verdict: str = "", detail: str = "") -> Memory:
-        return changed(m, status=Status(time, m.activation, state, verdict, detail))
+    def _status(
+        self, m: Memory, time: float, state: str, verdict: str = "", detail: str = "", cause: str = Cause.NONE
+    ) -> Memory:
+        return changed(m, status=Status(time, m.activation, state, verdict, detail, cause=str(cause)))
 
     def _valve(self, m: Memory, state: RobotState, turn: TurnState) -> np.ndarray | None:
         """X_BV of the valve that was measured last, turned as the hands left it; None if there is none near."""
@@ -275,8 +285,9 @@ class KinematicApproach:
         arc = best_arc(X_BV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view)
         if arc.margin < self.stance.margin_min:
             m = self._find_stance(time, changed(m, stance_looks=m.looks, seen=-1), mode, estimate)
+            detail = f"arm margin {arc.margin:.2f} from here"
             return self._status(
-                changed(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, f"stance: arm margin {arc.margin:.2f}"
+                changed(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, detail, cause=Cause.STANCE
             )
         grasps = {side: compose(X_BV, hand_in_valve(side, arc.swapped, self.marker)) for side in SIDES}
         plan = GraspPlan(
@@ -341,8 +352,8 @@ class KinematicApproach:
         reached = [q for q in arms if q is not None]
         return np.concatenate(reached) if len(reached) == len(arms) else None
 
-    # ------------------------------------------------------------ verify
-    def _verify(
+    # ------------------------------------------------------------ fold
+    def _fold(
         self,
         time: float,
         m: Memory,
@@ -359,7 +370,22 @@ class KinematicApproach:
             if m.phase == "blocked":
                 return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path home")
         if m.phase == "home":
-            m = changed(m, phase="look", since=time)
+            m = self._status(changed(m, phase="end"), time, "succeeded", detail="arms home")
+        return m
+
+    # ------------------------------------------------------------ verify
+    def _verify(
+        self,
+        time: float,
+        m: Memory,
+        state: RobotState,
+        mode: ModeState,
+        estimate: RectangleEstimate,
+        marks: HandleMarks,
+        turn: TurnState,
+    ) -> Memory:
+        if m.phase == "start":
+            m = self._status(changed(m, phase="look", since=time), time, "running")
         if m.phase != "look":
             return m
         m = self._look(time, m, estimate)
@@ -377,7 +403,7 @@ class KinematicApproach:
         detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(mode.turn_angle):.2f} deg"
         state_now = "succeeded" if missing <= self.config.angle_tolerance else "failed"
         verdict = Verdict.NONE if state_now == "succeeded" else Verdict.SLIP
-        return changed(m, status=Status(time, m.activation, state_now, verdict, detail, 1.0, seen))
+        return changed(m, status=self._seen(time, m, state_now, verdict, detail, seen))
 
     def _drift(self, looks: tuple[RectangleEstimate, ...]) -> float | None:
         """How fast the valve turns, by the slope of its angle over the looks [rad/s]; None: too few of them to tell.
@@ -405,8 +431,12 @@ class KinematicApproach:
         fused = fuse(m.looks[-1:])
         seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, turn.angle)
         camera = f"camera sees {np.degrees(seen):.2f} deg, turning by {np.degrees(drift):+.2f} deg/s"
-        status = Status(time, m.activation, "failed", Verdict.UNVERIFIED, f"{camera}, {hands}", 1.0, seen)
+        status = self._seen(time, m, "failed", Verdict.UNVERIFIED, f"{camera}, {hands}", seen)
         return changed(m, status=status)
+
+    def _seen(self, time: float, m: Memory, state: str, verdict: str, detail: str, angle: float) -> Status:
+        """A status with the angle that the camera saw [rad]."""
+        return Status(time, m.activation, state, verdict, detail, 1.0, angle, seen=True)
 
     def seen_angle(self, X_OV0: np.ndarray, X_OV1: np.ndarray, axis_known: bool, by_hands: float) -> float:
         """The turned angle by camera [rad]. The rectangle repeats every quarter turn, with the green marks every half:

@@ -35,7 +35,7 @@ class KinematicApproachSystem(Block[KinematicApproachInputs, Memory]):
     marks        in   HandleMarks        green marks in the wrist images
     turn         in   TurnState          how far the hands say that the valve was turned
     command      out  Command            arms and grippers
-    status       out  Status             measure, reach, verify
+    status       out  Status             measure, reach, fold, verify
     stance       out  Stance             where the base should stand, in O
     plan         out  GraspPlan          the valve and the grasps in B, measured at rest
     """

@@ -34,11 +34,11 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.motion import follow, slew, towards
+from valve_drake.task.modes import HOLD, TABLE, WATCHED
 
 HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading) in O, torso (3,) -> X_OL (3, 4)
 
-DRIVING = (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH)
-WATCHING = (*DRIVING, Mode.MEASURE)  # modes that fail when the marker is lost
+DRIVING = tuple(mode for mode in WATCHED if TABLE[mode].base != HOLD)
 
 
 @dc.dataclass
@@ -163,7 +163,7 @@ def step(
         twist = np.array([0.0, m.turn_rate])
     else:
         m = _sight(config, m, position, estimate)
-        if mode.mode in WATCHING and m.result == "running":
+        if mode.mode in WATCHED and m.result == "running":
             blind = time - max(m.since, m.target_time)
             if blind > config.lost_after:
                 m = _end(m, "failed", Verdict.MARKER_LOST, f"marker not seen for {blind:.1f} s")
@@ -200,7 +200,7 @@ def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") 
 
 
 def _status(config: ValveSearchConfig, m: Memory, time: float, mode: ModeState) -> Status:
-    if mode.mode != Mode.SEARCH and mode.mode not in WATCHING:
+    if mode.mode != Mode.SEARCH and mode.mode not in WATCHED:
         return Status(time=time, activation=mode.activation)
     progress = 0.0
     if mode.mode == Mode.SEARCH:

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from valve_drake.checks import require
-from valve_drake.config import Config, number, plain, table
-from valve_drake.messages import CameraFrame, MarkerCandidate, Mode, Segmentation
+from valve_drake.config import Config, number, plain
+from valve_drake.messages import CameraFrame, MarkerCandidate, Segmentation
 from valve_drake.perception.marker import NEXT
 
 # Red, green and brightness of RGB; the offset stands for the noise that would else make colours of black.
@@ -24,13 +24,6 @@ _COLORS = {"red": 0, "green": 1}
 _HALF_RESOLUTION_SIZE = 100  # regions from this size on are cut out at half resolution; raise it for precision [px]
 _KERNEL_3X3 = np.ones((3, 3), np.uint8)
 _MEAN_STEP = 4  # neighbourhood means are computed at the half resolution divided by this
-
-
-_EVERY = {"search": 1, "measure": 1, "verify": 2}
-_EVERY |= {"rough_approach": 4, "fine_approach": 2}  # odometry is good for half a second
-_EVERY |= {mode: 16 for mode in ("reach", "servo", "grasp", "turn", "release", "retreat")}  # for the log
-_EVERY |= {mode: 0 for mode in ("idle", "done", "failed", "stopped")}
-MODES = tuple(mode.value for mode in Mode)
 
 
 @dc.dataclass
@@ -66,7 +59,6 @@ class ColorSegmentationConfig(RegionConfig):
     border: int = number(3, 0, 100, "a region this near to the image's border is cut off [px]")
     follow: bool = plain(True, "look only round the last candidates, and everywhere if they are gone")
     full_every: int = number(4, 1, 1000, "and everywhere at every n-th look")
-    every: dict[str, int] = table(_EVERY, 0, 1000, "in each mode: look every n-th step, 0 = never", MODES)
 
 
 @dc.dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import dataclasses as dc
 
-from valve_drake.messages import CameraFrame, MarkerCandidate, Mode, ModeState, Segmentation, SegmentationPair
+from valve_drake.messages import CameraFrame, MarkerCandidate, ModeState, Segmentation, SegmentationPair
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.ports import Block, Inputs, Outputs
 
@@ -24,7 +24,7 @@ class ColorSegmentationInputs(Inputs):
 
 
 class ColorSegmentationSystem(Block[ColorSegmentationInputs, _Memory]):
-    """Looks at both head images of one capture time, as often as the mode asks (config.every); else holds.
+    """Looks at both head images of one capture time, as often as the mode asks; else holds.
 
     port              dir  type              notes
     ----------------  ---  ----------------  -----------------
@@ -52,7 +52,7 @@ class ColorSegmentationSystem(Block[ColorSegmentationInputs, _Memory]):
 
     def step(self, time: float, inputs: ColorSegmentationInputs, memory: _Memory) -> tuple[_Memory, Outputs]:
         state = inputs.mode
-        every = self._config.every.get(state.mode, 0)
+        every = state.head_every
         memory = dc.replace(memory, idle=memory.idle + 1)
         if every == 0 or memory.idle < every:
             return memory, {}
@@ -61,7 +61,7 @@ class ColorSegmentationSystem(Block[ColorSegmentationInputs, _Memory]):
             return memory, {}
         if left.sequence == memory.sequence:
             return memory, {}
-        follow = self._config.follow and state.mode != Mode.SEARCH and (memory.looks + 1) % self._config.full_every
+        follow = self._config.follow and not state.afresh and (memory.looks + 1) % self._config.full_every
         seen, boxes = [], []
         for frame, box in zip((left, right), memory.boxes):
             one, box = self._look(frame, box if follow else None)

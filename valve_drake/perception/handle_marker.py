@@ -8,10 +8,9 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.config import Config, number, table
+from valve_drake.config import Config, number
 from valve_drake.messages import HandleMark
 from valve_drake.perception.color_segmentation import (
-    MODES,
     Region,
     RegionConfig,
     green_regions,
@@ -38,9 +37,6 @@ class HandleMarkerConfig(Config):
     min_fill: float = number(0.85, 0.3, 1.0, "region's area over its quadrilateral's, and the inverse")
     max_aspect: float = number(4.0, 1.0, 20.0, "long side over short side in the image")
     center_weight: float = number(1.0, 0.0, 100.0, "how much nearness to the image's centre counts against size")
-    every: dict[str, int] = table(
-        {"reach": 4, "servo": 1, "grasp": 16}, 0, 1000, "in each mode: look every n-th step, 0 or none = never", MODES
-    )
 
 
 def find_mark(image: np.ndarray, config: HandleMarkerConfig) -> HandleMark:

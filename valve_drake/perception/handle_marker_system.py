@@ -21,7 +21,7 @@ class HandleMarkerInputs(Inputs):
 
 
 class HandleMarkerSystem(Block[HandleMarkerInputs, _Memory]):
-    """Looks at both wrist images as often as the mode asks (config.every); else holds.
+    """Looks at both wrist images as often as the mode asks; else holds.
 
     port               dir  type         notes
     -----------------  ---  -----------  -----------------
@@ -49,7 +49,7 @@ class HandleMarkerSystem(Block[HandleMarkerInputs, _Memory]):
 
     def step(self, time: float, inputs: HandleMarkerInputs, memory: _Memory) -> tuple[_Memory, Outputs]:
         state = inputs.mode
-        every = self._config.every.get(state.mode, 0)
+        every = state.wrist_every
         memory = dc.replace(memory, idle=memory.idle + 1)
         if every == 0 or memory.idle < every:
             return memory, {}

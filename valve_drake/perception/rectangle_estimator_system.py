@@ -7,7 +7,7 @@ import numpy as np
 
 from valve_drake import frames
 from valve_drake.camera.lens import StereoHead
-from valve_drake.messages import MarkerEdges, Mode, ModeState, RectangleEstimate, RobotState
+from valve_drake.messages import MarkerEdges, ModeState, RectangleEstimate, RobotState
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
 from valve_drake.ports import Block, Inputs, Outputs
@@ -64,7 +64,7 @@ class RectangleEstimatorSystem(Block[RectangleEstimatorInputs, _Memory]):
 
     def step(self, time: float, inputs: RectangleEstimatorInputs, memory: _Memory) -> tuple[_Memory, Outputs]:
         state = inputs.mode
-        if state.mode == Mode.SEARCH and state.activation != memory.search:
+        if state.afresh and state.activation != memory.search:
             memory = _Memory(sequence=memory.sequence, search=state.activation)
         edges = inputs.edges
         if edges.sequence == memory.sequence:

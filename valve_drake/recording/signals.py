@@ -46,9 +46,9 @@ from valve_drake.recording import foxglove
 from valve_drake.recording.recorder_system import ONCE, Signal
 from valve_drake.recording.refilled import STAMP, Refilled, slot
 from valve_drake.recording.schemas import Encoded, Vector, Wrench, proto_class, serialized
+from valve_drake.task.modes import BEHAVIORS
 
 SLOW = 1 / 32  # period of large messages and of those that only people look at [s]
-BEHAVIORS = ("valve_search", "base_approach", "kinematic_approach", "image_servo", "hybrid_rotation")
 
 OUTPUTS: tuple[tuple[str, str, type[Message]], ...] = (  # block, port, kind: recorded as they are
     ("color_segmentation", "segmentation", SegmentationPair),

@@ -1,10 +1,10 @@
 """The only writer to the robot: one command per tick, taken from the block that owns each group in this mode.
 
-SOURCE says who commands which group in which mode. A group without an owner holds: the base brakes to zero twist,
-joints brake and stay. So does a group whose command is missing, older than `max_age`, not finite or otherwise wrong,
-every group while the robot's state or the mode is that old, and a group whose device has reported nothing for that
-long (both arms if one of them is silent, or the other would pull at what both hold). An emergency stop holds everything
-but the grippers, so that a hand can always be opened. In failed and stopped the hands open, whatever happened before.
+Each mode's row says who commands which group (task/modes.py). A group that nobody commands holds: the base brakes to
+zero twist, joints brake and stay. So does a group whose command is missing, older than `max_age`, not finite or
+otherwise wrong, every group while the robot's state or the mode is that old, and a group whose device has reported
+nothing for that long (both arms if one of them is silent, or the other would pull at what both hold). An emergency stop
+holds everything but the grippers, so that a hand can always be opened. In failed and stopped the hands open, whatever happened before.
 
 Position, speed and acceleration are bounded by motion.follow: within the bounds a command passes unchanged.
 The first command of each joint is its measured position.
@@ -22,9 +22,7 @@ from valve_drake.kinematics import ARM_LIMITS
 from valve_drake.memory import changed
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, Health, Mode, ModeState, RobotState, SelectorReport
 from valve_drake.motion import follow
-
-BEHAVIORS = ("valve_search", "base_approach", "kinematic_approach", "image_servo", "hybrid_rotation")
-HOLD, OPEN = "hold", "command_selector"  # nobody commands this group; the selector itself opens the hand
+from valve_drake.task.modes import HOLD, OPEN, TABLE
 
 # Groups of joints commanded by position, in this order in every vector of this file.
 JOINTS = {
@@ -51,28 +49,7 @@ PORTS = {
 }
 
 
-def _row(base: str, hands: str, grippers: str = "") -> dict[str, str]:
-    grippers = grippers or hands
-    return dict(zip(GROUPS, (base, "valve_search", hands, hands, grippers, grippers)))
-
-
-SOURCE: dict[Mode, dict[str, str]] = {
-    Mode.IDLE: _row(HOLD, "kinematic_approach"),
-    Mode.SEARCH: _row("valve_search", "kinematic_approach"),
-    Mode.ROUGH_APPROACH: _row("base_approach", "kinematic_approach"),
-    Mode.FINE_APPROACH: _row("base_approach", "kinematic_approach"),
-    Mode.MEASURE: _row(HOLD, "kinematic_approach"),
-    Mode.REACH: _row(HOLD, "kinematic_approach"),
-    Mode.SERVO: _row(HOLD, "image_servo"),
-    Mode.GRASP: _row(HOLD, "hybrid_rotation"),
-    Mode.TURN: _row(HOLD, "hybrid_rotation"),
-    Mode.RELEASE: _row(HOLD, "hybrid_rotation"),
-    Mode.VERIFY: _row(HOLD, "kinematic_approach"),
-    Mode.RETREAT: _row("base_approach", "kinematic_approach"),
-    Mode.DONE: dict.fromkeys(GROUPS, HOLD),
-    Mode.FAILED: dict.fromkeys(GROUPS, HOLD) | dict.fromkeys(GRIPPERS, OPEN),
-    Mode.STOPPED: dict.fromkeys(GROUPS, HOLD) | dict.fromkeys(GRIPPERS, OPEN),
-}
+SOURCE = {mode: {group: row.source(group) for group in GROUPS} for mode, row in TABLE.items()}
 
 
 @dc.dataclass

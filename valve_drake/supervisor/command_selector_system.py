@@ -7,7 +7,6 @@ import numpy as np
 from valve_drake.messages import Command, Health, ModeState, RobotState, SelectorReport
 from valve_drake.ports import Block, Inputs, Outputs
 from valve_drake.supervisor.command_selector import (
-    BEHAVIORS,
     PORTS,
     CommandSelectorConfig,
     Memory,
@@ -15,6 +14,7 @@ from valve_drake.supervisor.command_selector import (
     start,
     step,
 )
+from valve_drake.task.modes import BEHAVIORS
 
 
 class CommandSelectorInputs(Inputs):

@@ -1,17 +1,11 @@
-"""Which mode the robot is in, and why: one pure transition function.
-
-    idle -(open, close)-> search -> rough_approach -> fine_approach -> measure -> reach -> servo -> grasp -> turn
-         -> release -> verify -> retreat -> done
+"""Which mode the robot is in, and why: one pure transition function over the table of modes (task/modes.py).
 
 One block owns each mode: its Status, carrying this activation's number, ends it. What else can end a mode:
 
-    marker lost while driving or measuring      -> search again
-    measure: the stance does not serve          -> fine_approach again
-    servo failed                                -> reach again
-    grasp missed                                -> release -> reach again
+    a failure that the mode's row retries       -> as the row says, so often in a run
     any other failure or a missed deadline      -> the run will fail with this verdict, off the valve first:
-        hands at the handles (servo, grasp, turn)  -> release -> verify -> retreat -> failed
-        hands near them (reach)                    -> verify (folds the arms) -> retreat -> failed
+        hands at the handles                       -> release -> fold -> verify -> retreat -> failed
+        hands near them (reach)                    -> fold -> retreat -> failed
         elsewhere                                  -> failed
     fault or operator's stop                    -> hands at the handles: release, then failed or stopped;
                                                    elsewhere at once, the robot held still
@@ -40,56 +34,10 @@ from valve_drake.messages import (
     Status,
     Verdict,
 )
-
-NEXT = {
-    Mode.SEARCH: Mode.ROUGH_APPROACH,
-    Mode.ROUGH_APPROACH: Mode.FINE_APPROACH,
-    Mode.FINE_APPROACH: Mode.MEASURE,
-    Mode.MEASURE: Mode.REACH,
-    Mode.REACH: Mode.SERVO,
-    Mode.SERVO: Mode.GRASP,
-    Mode.GRASP: Mode.TURN,
-    Mode.TURN: Mode.RELEASE,
-}  # release, verify and retreat end differently when the run is failing
-
-OWNER = {
-    Mode.SEARCH: "valve_search",
-    Mode.ROUGH_APPROACH: "base_approach",
-    Mode.FINE_APPROACH: "base_approach",
-    Mode.MEASURE: "kinematic_approach",
-    Mode.REACH: "kinematic_approach",
-    Mode.SERVO: "image_servo",
-    Mode.GRASP: "hybrid_rotation",
-    Mode.TURN: "hybrid_rotation",
-    Mode.RELEASE: "hybrid_rotation",
-    Mode.VERIFY: "kinematic_approach",
-    Mode.RETREAT: "base_approach",
-}
-
-BEHAVIORS = tuple(dict.fromkeys(OWNER.values()))
-TERMINAL = (Mode.DONE, Mode.FAILED, Mode.STOPPED)
-CONTACT = (Mode.SERVO, Mode.GRASP, Mode.TURN)  # the hands are at the handles
-ENDING = (Mode.RELEASE, Mode.VERIFY, Mode.RETREAT)  # the way off the valve: their own deadlines bound them
-WATCHED = (Mode.ROUGH_APPROACH, Mode.FINE_APPROACH, Mode.MEASURE)  # valve_search says when the marker is lost
+from valve_drake.task.modes import DEADLINES, HEAD_EVERY, MODES, RETRIES, TABLE, TERMINAL, WATCHED, WRIST_EVERY
 
 # What a behaviour may give as the reason of its failure; anything else is a fault of the program.
 FAILURES = tuple(v for v in Verdict if v not in (Verdict.NONE, Verdict.TURNED, Verdict.STOPPED))
-
-
-DEADLINES = {
-    "search": 60.0,
-    "rough_approach": 30.0,
-    "fine_approach": 45.0,
-    "measure": 6.0,
-    "reach": 20.0,
-    "servo": 20.0,
-    "grasp": 12.0,
-    "turn": 60.0,
-    "release": 8.0,
-    "verify": 20.0,
-    "retreat": 15.0,
-}  # of each mode [s]
-RETRIES = {"marker_lost": 2, "measure": 2, "servo": 2, "grasp": 2}
 
 
 @dc.dataclass
@@ -103,6 +51,12 @@ class SupervisorConfig(Config):
         160.0, 1.0, 3600.0, "from the operator's command until the run gives up; a good one takes 60 s [s]"
     )
     retries: dict[str, int] = table(RETRIES, 0, 10, "in a run, by what failed", tuple(RETRIES), complete=True)
+    head_every: dict[str, int] = table(
+        HEAD_EVERY, 0, 1000, "in each mode: perception looks at every n-th pair of the head's images, 0: at none", MODES
+    )
+    wrist_every: dict[str, int] = table(
+        WRIST_EVERY, 0, 1000, "in each mode: it looks at every n-th of the wrists' images, 0: at none", MODES
+    )
     max_age: dict[str, float] = table(
         dict.fromkeys(CAMERAS, 1.0),
         0.05,
@@ -127,11 +81,11 @@ class State:
     verdict: Verdict = Verdict.NONE
     reason: str = ""
     sequence: int = -1  # of the last operator command taken
-    after_release: Mode = Mode.VERIFY  # where release leads
+    after_release: Mode = Mode.FOLD  # where release leads
     entered: tuple[Mode, ...] = ()  # modes of this run, in order
     retried: tuple[str, ...] = ()  # what failed and was tried again in this run
 
-    def message(self, time: float) -> ModeState:
+    def message(self, time: float, config: "SupervisorConfig") -> ModeState:
         return ModeState(
             time=time,
             mode=self.mode.value,
@@ -141,6 +95,9 @@ class State:
             turn_angle=self.turn_angle,
             verdict=self.verdict.value,
             reason=self.reason,
+            head_every=config.head_every.get(self.mode.value, 0),
+            wrist_every=config.wrist_every.get(self.mode.value, 0),
+            afresh=TABLE[self.mode].afresh,
         )
 
 
@@ -169,19 +126,20 @@ def step(
     if fault and not _aborting(s):
         return _abort(s, time, Mode.FAILED, Verdict.FAULT, fault)
 
-    status = statuses.get(OWNER[s.mode])
+    owner = TABLE[s.mode].owner
+    status = statuses.get(owner)
     if status is not None and status.activation == s.activation:
         if status.state == "succeeded":
             return _succeed(s, time, status)
         if status.state == "failed":
-            return _fail(config, s, time, OWNER[s.mode], status)
+            return _fail(config, s, time, owner, status)
     watch = statuses.get("valve_search")
     if s.mode in WATCHED and watch is not None and watch.activation == s.activation and watch.state == "failed":
         return _fail(config, s, time, "valve_search", watch)
     if time - s.since > deadline(config, s):
         return _give_up(s, time, Verdict.TIMEOUT, f"{s.mode.value} took more than {deadline(config, s):.0f} s")
     limit = config.run_deadline + config.turn_allowance * abs(s.turn_angle)
-    if s.mode not in ENDING and time - s.began > limit:
+    if not TABLE[s.mode].ending and time - s.began > limit:
         return _give_up(s, time, Verdict.TIMEOUT, f"the run took more than {limit:.0f} s")
     return s
 
@@ -246,7 +204,7 @@ def _abort(s: State, time: float, end: Mode, verdict: Verdict, reason: str) -> S
     """Fault or stop: hands off the valve first, everything else stands still at once."""
     if s.mode == Mode.RELEASE:  # it goes on, but nothing comes after it
         return changed(s, after_release=end, verdict=verdict, reason=reason)
-    if s.mode in CONTACT:
+    if TABLE[s.mode].contact:
         return _enter(s, time, Mode.RELEASE, reason, verdict=verdict, after_release=end)
     return _enter(s, time, end, reason, verdict=verdict)
 
@@ -255,44 +213,31 @@ def _succeed(s: State, time: float, status: Status) -> State:
     reason = status.detail or f"{s.mode.value} succeeded"
     if s.mode == Mode.RELEASE:
         return _enter(s, time, s.after_release, s.reason if s.verdict else reason)
-    if s.mode == Mode.VERIFY:
-        if Mode.TURN not in s.entered:  # it only folded the arms: nothing was turned
-            return _enter(s, time, Mode.RETREAT, s.reason)
-        return _enter(s, time, Mode.RETREAT, reason, verdict=Verdict.TURNED)
+    if s.mode == Mode.FOLD:
+        nothing_turned = Mode.TURN not in s.entered  # then there is nothing to verify
+        return _enter(s, time, Mode.RETREAT if nothing_turned else Mode.VERIFY, s.reason if s.verdict else reason)
     if s.mode == Mode.RETREAT:
         return _enter(s, time, Mode.DONE if s.verdict == Verdict.TURNED else Mode.FAILED, s.reason)
-    return _enter(s, time, NEXT[s.mode], reason, after_release=Mode.VERIFY)
+    turned = {"verdict": Verdict.TURNED} if s.mode == Mode.VERIFY else {}
+    after = TABLE[s.mode].next
+    assert after is not None
+    return _enter(s, time, after, reason, after_release=Mode.FOLD, **turned)
 
 
 def _fail(config: SupervisorConfig, s: State, time: float, block: str, status: Status) -> State:
     """A behaviour gave up: try again, or end the run."""
     verdict = Verdict(status.verdict) if status.verdict in FAILURES else Verdict.FAULT
     reason = f"{block}: {status.detail or verdict.value}"
-    if verdict == Verdict.MARKER_LOST and s.mode in WATCHED:
-        cause, again = "marker_lost", Mode.SEARCH
-    elif s.mode == Mode.MEASURE and status.detail.startswith("stance"):
-        cause, again = "measure", Mode.FINE_APPROACH
-    elif s.mode == Mode.SERVO:
-        cause, again = "servo", Mode.REACH
-    elif s.mode == Mode.GRASP and verdict == Verdict.GRASP_MISSED:
-        cause, again = "grasp", Mode.RELEASE
-    else:
+    retry = TABLE[s.mode].retry_of(status.cause, verdict)
+    if retry is None or s.retried.count(retry.limit) >= config.retries[retry.limit]:
         return _give_up(s, time, verdict, reason)
-    if s.retried.count(cause) >= config.retries[cause]:
-        return _give_up(s, time, verdict, reason)
-    after = Mode.REACH if again == Mode.RELEASE else Mode.VERIFY
-    return _enter(s, time, again, reason, retried=(*s.retried, cause), after_release=after)
+    after = retry.after_release or Mode.FOLD
+    return _enter(s, time, retry.mode, reason, retried=(*s.retried, retry.limit), after_release=after)
 
 
 def _give_up(s: State, time: float, verdict: Verdict, reason: str) -> State:
     """This run will fail. The first verdict stays, unless it was `turned` and the retreat then went wrong."""
     if s.verdict not in (Verdict.NONE, Verdict.TURNED):
         verdict, reason = s.verdict, s.reason
-    if s.mode in CONTACT:
-        return _enter(s, time, Mode.RELEASE, reason, verdict=verdict, after_release=Mode.VERIFY)
-    if s.mode == Mode.REACH:
-        return _enter(s, time, Mode.VERIFY, reason, verdict=verdict)
-    if s.mode == Mode.VERIFY:
-        return _enter(s, time, Mode.RETREAT, reason, verdict=verdict)
-    end = s.after_release if _aborting(s) else Mode.FAILED
-    return _enter(s, time, end, reason, verdict=verdict)
+    end = s.after_release if _aborting(s) else TABLE[s.mode].off
+    return _enter(s, time, end, reason, verdict=verdict, after_release=s.after_release if _aborting(s) else Mode.FOLD)

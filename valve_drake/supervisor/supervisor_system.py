@@ -2,7 +2,8 @@
 
 from valve_drake.messages import Health, ModeState, OperatorCommand, SelectorReport, Status
 from valve_drake.ports import Block, Inputs, Outputs
-from valve_drake.supervisor.supervisor import BEHAVIORS, State, SupervisorConfig, step
+from valve_drake.supervisor.supervisor import State, SupervisorConfig, step
+from valve_drake.task.modes import BEHAVIORS
 
 
 class SupervisorInputs(Inputs):
@@ -41,4 +42,4 @@ class SupervisorSystem(Block[SupervisorInputs, State]):
     def step(self, time: float, inputs: SupervisorInputs, memory: State) -> tuple[State, Outputs]:
         statuses = {name: inputs[name] for name in BEHAVIORS}
         state = step(self.config, memory, time, statuses, inputs.health, inputs.operator, inputs.selector)
-        return state, {"mode": state.message(time)}
+        return state, {"mode": state.message(time, self.config)}

@@ -1,0 +1,1 @@
+"""What the robot does with the valve: the modes."""
