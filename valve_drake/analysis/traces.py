@@ -355,7 +355,8 @@ class Traces:
         verifying = {span.activation for span in self.spans if span.mode == Mode.VERIFY}
         angle = None
         for _, status in self._messages("/kinematic_approach/status"):
-            if status.activation in verifying and status.seen:
+            # A log of a program that had no `seen` says so by its progress.
+            if status.activation in verifying and (status.seen or status.progress == 1.0):
                 angle = status.value
         return angle
 

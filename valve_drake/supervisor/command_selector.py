@@ -4,7 +4,8 @@ Each mode's row says who commands which group (task/modes.py). A group that nobo
 zero twist, joints brake and stay. So does a group whose command is missing, older than `max_age`, not finite or
 otherwise wrong, every group while the robot's state or the mode is that old, and a group whose device has reported
 nothing for that long (both arms if one of them is silent, or the other would pull at what both hold). An emergency stop
-holds everything but the grippers, so that a hand can always be opened. In failed and stopped the hands open, whatever happened before.
+holds everything but the grippers, so that a hand can always be opened. In failed and stopped the hands open, whatever
+happened before.
 
 Position, speed and acceleration are bounded by motion.follow: within the bounds a command passes unchanged.
 The first command of each joint is its measured position.
