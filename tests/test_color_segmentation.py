@@ -18,13 +18,11 @@ from valve_drake.messages import CameraFrame, ModeState
 from valve_drake.perception.color_segmentation import (
     ColorSegmentationConfig,
     _shares,
-    middle,
-    polygon_area,
-    quadrilateral,
     segment,
 )
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
 from valve_drake.perception.marker import Marker
+from valve_drake.perception.quadrilateral import polygon_area
 
 ROOT = pathlib.Path(__file__).parents[1]
 HEAD = load_head(ROOT / "models" / "calibration" / "head.yaml")
@@ -121,25 +119,6 @@ def test_look_round_the_last_place_sees_the_same_marker():
     assert len(green) == 2
 
 
-def test_quadrilateral_turns_clockwise_and_a_triangle_is_none():
-    square = np.array([[10, 10], [10, 60], [70, 60], [70, 10]])  # counter-clockwise as seen
-    corners = quadrilateral(square)
-    d = np.roll(corners, -1, 0) - corners
-    assert (d[:, 0] * np.roll(d, -1, 0)[:, 1] - d[:, 1] * np.roll(d, -1, 0)[:, 0] > 0).all()
-    assert quadrilateral(np.array([[0, 0], [60, 0], [30, 50]])) is None
-
-
-def test_a_covered_corner_is_where_its_sides_would_meet():
-    square = np.array([[10, 10], [110, 20], [100, 120], [5, 105]])
-    for k in range(4):
-        before, corner, after = square[k - 1], square[k], square[(k + 1) % 4]
-        cut = [corner + 0.2 * (before - corner), corner + 0.3 * (after - corner)]
-        outline = np.vstack([square[:k], cut, square[k + 1 :]])
-        off = np.linalg.norm(quadrilateral(outline)[:, None] - square, axis=2).min(0)
-        assert off.max() < 2
-    assert quadrilateral(np.array([[0, 0], [60, 0], [80, 57], [30, 92], [-20, 57]])) is None  # no corner of a pentagon
-
-
 def true_corners(X_LV):
     P = frames.apply(X_LV, Marker().corners())
     return LENS.project(P[:, :2] / P[:, 2:])
@@ -169,12 +148,6 @@ def test_a_share_is_nearly_the_same_in_half_the_light():
     image[:] = RED
     light, shade = (float(_shares((factor * image).astype(np.uint8))["red"].mean()) for factor in (1, 0.5))
     assert 0.8 * light < shade <= light
-
-
-def test_diagonals_meet_in_the_image_of_the_centre():
-    X = facing(0.4, 0.7, 0.2, 0.3)
-    P = frames.apply(X, Marker().corners())
-    np.testing.assert_allclose(middle(P[:, :2] / P[:, 2:]), X[:2, 3] / X[2, 3], atol=1e-12)
 
 
 def test_real_photographs_red_square_found_in_both_cameras():

@@ -12,9 +12,9 @@ from drawn_scene import Drawing, draw_valve, facing, pose_error
 
 from valve_drake import frames
 from valve_drake.analysis.drawn_images import Canvas, draw_board
-from valve_drake.camera.calibration import triangulate_all
 from valve_drake.camera.calibration_file import save_camera
 from valve_drake.camera.lens import OpenCvLens, StereoHead, load_head
+from valve_drake.camera.triangulation import triangulate_all
 from valve_drake.cli import main
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.photograph import look

@@ -8,8 +8,9 @@ from valve_drake.analysis import experiments
 from valve_drake.analysis.drawn_images import PLATE, RED, Canvas, draw_board
 from valve_drake.perception import joint_fit as mut
 from valve_drake.perception import line_fitting
-from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads, side_lines
+from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads
 from valve_drake.perception.marker import NEXT, Marker
+from valve_drake.perception.quadrilateral import side_lines
 
 EYE, MARKER = experiments.head().left, Marker()
 

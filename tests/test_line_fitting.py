@@ -15,10 +15,11 @@ from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError
 from valve_drake.messages import CameraFrame, Segmentation, SegmentationPair
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
-from valve_drake.perception.line_fitting import LineFittingConfig, _even_light, fit_pair, fit_quads, meet, side_lines
+from valve_drake.perception.line_fitting import LineFittingConfig, _even_light, fit_pair, fit_quads
 from valve_drake.perception.line_fitting_system import LineFittingSystem
 from valve_drake.perception.marker import Marker
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig
+from valve_drake.perception.matching import StereoPositioningConfig
+from valve_drake.perception.quadrilateral import meet, side_lines
 
 HEAD = load_head(pathlib.Path(__file__).parents[1] / "models" / "calibration" / "head.yaml")
 MARKER, CONFIG = Marker(), LineFittingConfig()

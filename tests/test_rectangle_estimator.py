@@ -15,8 +15,9 @@ from valve_drake.checks import ConfigError
 from valve_drake.messages import MarkerEdges, ModeState, QuadEdges, RectangleEstimate, RobotState
 from valve_drake.perception import estimate_rectangle
 from valve_drake.perception.joint_fit import NODES
-from valve_drake.perception.line_fitting import meet, side_lines
 from valve_drake.perception.marker import NEXT, Marker
+from valve_drake.perception.matching import epipolar_offset
+from valve_drake.perception.quadrilateral import meet, side_lines
 from valve_drake.perception.rectangle_estimator import (
     RectangleEstimatorConfig,
     Track,
@@ -28,7 +29,6 @@ from valve_drake.perception.rectangle_estimator import (
     fuse,
 )
 from valve_drake.perception.rectangle_estimator_system import RectangleEstimatorSystem
-from valve_drake.perception.stereo_positioning import epipolar_offset
 
 ROOT = pathlib.Path(__file__).parents[1]
 HEAD = load_head(ROOT / "models" / "calibration" / "head.yaml")

@@ -28,8 +28,8 @@ from pydrake.systems.sensors import CameraInfo
 from valve_drake import resources, scenario
 from valve_drake.camera.lens import Lens, load_head
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
-from valve_drake.perception.joint_fit import meet
-from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads, side_lines
+from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads
+from valve_drake.perception.quadrilateral import meet, side_lines
 from valve_drake.stations.camera_rig import CameraRig, _Lensed
 from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer, read_obj
 from valve_drake.stations.simulated import make_mounts

@@ -182,7 +182,8 @@ def test_a_rendered_marker_lies_where_the_lens_says_to_a_twentieth_of_a_pixel(ca
     """Half-pixel conventions of renderer, lens and OpenCV, the camera's mounting and eq. (1), all at once."""
     from valve_drake.camera.lens import load_head
     from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
-    from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads, meet, side_lines
+    from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads
+    from valve_drake.perception.quadrilateral import meet, side_lines
     from valve_drake.resources import models
 
     rig = Rig(

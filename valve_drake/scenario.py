@@ -25,8 +25,8 @@ from valve_drake.perception.color_segmentation import ColorSegmentationConfig
 from valve_drake.perception.handle_marker import HandleMarkerConfig
 from valve_drake.perception.line_fitting import LineFittingConfig
 from valve_drake.perception.marker import Marker
+from valve_drake.perception.matching import StereoPositioningConfig
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig
 from valve_drake.stations.faults import FaultConfig
 from valve_drake.stations.lcm_channels import HardwareConfig
 from valve_drake.stations.simulation_config import SimulationConfig

@@ -23,13 +23,14 @@ from valve_drake import frames, resources, yaml_file
 from valve_drake.analysis import hand_eye_experiment
 from valve_drake.analysis.drawn_images import GREEN, METAL, PLATE, RED, WALL, Canvas, draw_bar, draw_board
 from valve_drake.camera.lens import StereoHead, load_head
+from valve_drake.camera.triangulation import triangulate
 from valve_drake.checks import require, require_in
 from valve_drake.messages import CameraFrame, MarkerEdges, QuadEdges, SegmentationPair
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import Marker
+from valve_drake.perception.matching import StereoPositioningConfig
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig, triangulate
 
 BLUR, NOISE = 0.7, 2.0  # standard deviations, unless given: of the lens's blur [px], of a pixel's colour [grey levels]
 NOISES = (1.0, 2.0, 4.0)

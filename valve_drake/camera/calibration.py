@@ -28,6 +28,7 @@ from valve_drake import frames
 from valve_drake.camera.board import Board
 from valve_drake.camera.least_squares import divided, minimize, skew, stepped, transform
 from valve_drake.camera.lens import KNOWN, Lens, OpenCvLens, StereoHead, check_baseline
+from valve_drake.camera.triangulation import triangulate_all
 from valve_drake.checks import ConfigError
 
 KINDS = ("opencv", "paper")
@@ -641,17 +642,6 @@ def _sights(fit: Fit, distance: float) -> tuple[np.ndarray, np.ndarray]:
         # Outside the image a lens model may fold back: such points project into the image but are not seen there.
         visible &= np.linalg.norm(lens.normalize(px[-1]) - xy, axis=1) < 1e-3
     return px[0][visible], px[1][visible]
-
-
-def triangulate_all(head: StereoHead, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Points (n, 3) in L nearest to the rays of raw px (n, 2), (n, 2): mid-points of the common perpendiculars."""
-    a = np.column_stack([head.left.normalize(left), np.ones(len(left))])
-    b = np.column_stack([head.right.normalize(right), np.ones(len(right))]) @ head.X_LR[:, :3].T
-    p = head.X_LR[:, 3]
-    aa, ab, bb, ap, bp = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1), a @ p, b @ p
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s, t = np.stack([bb * ap - ab * bp, ab * ap - aa * bp]) / (aa * bb - ab * ab)
-    return (s[:, None] * a + p + t[:, None] * b) / 2
 
 
 def _split_half(

@@ -13,8 +13,8 @@ from valve_drake.messages import CameraFrame, RectangleEstimate, Segmentation, S
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import Marker
+from valve_drake.perception.matching import StereoPositioningConfig
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig
 
 
 def estimate_rectangle(

@@ -16,6 +16,7 @@ import numpy as np
 from valve_drake.checks import require
 from valve_drake.config import Config, number, plain
 from valve_drake.messages import CameraFrame, MarkerCandidate, Segmentation
+from valve_drake.perception import quadrilateral
 from valve_drake.perception.marker import NEXT
 
 # Red, green and brightness of RGB; the offset stands for the noise that would else make colours of black.
@@ -99,56 +100,6 @@ def segmented(
 def green_regions(image: np.ndarray, config: RegionConfig) -> list[Region]:
     """Green regions cut out at full resolution, for the wrist cameras."""
     return _regions(image, _Half.of(image, (0, 0)), config, "green")[0]
-
-
-def quadrilateral(contour: np.ndarray) -> np.ndarray | None:
-    """The four corners that an outline (n, 2) simplifies to, clockwise as seen, or None -> (4, 2) [px].
-
-    A corner that something covers is where the sides beside it would meet.
-    """
-    hull = cv2.convexHull(contour.astype(np.float32).reshape(-1, 1, 2))
-    length = cv2.arcLength(hull, True)
-    for share in (0.02, 0.03, 0.045, 0.06, 0.08):
-        corners = cv2.approxPolyDP(hull, share * length, True)[:, 0].astype(float)
-        if len(corners) == 5:
-            corners = _without_cut(corners)
-        if len(corners) == 4:
-            return corners if _signed_area(corners) > 0 else corners[::-1]
-    return None
-
-
-def _without_cut(corners: np.ndarray) -> np.ndarray:
-    """A convex pentagon (5, 2) with that side removed whose neighbours then meet nearest, if they do so nearby."""
-    before, after = np.roll(corners, 1, 0), np.roll(corners, -2, 0)
-    end = np.roll(corners, -1, 0)
-    a, b, gap = corners - before, end - after, end - corners  # neighbours of side k, lengthened
-    turn = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    turn = np.where(np.abs(turn) < 1e-9, 1e-9, turn)
-    s = (gap[:, 0] * b[:, 1] - gap[:, 1] * b[:, 0]) / turn
-    t = (gap[:, 0] * a[:, 1] - gap[:, 1] * a[:, 0]) / turn
-    added = np.where((s > 0) & (t > 0), np.abs(s * t * turn), np.inf)  # twice the triangle's area
-    k = int(np.argmin(added))
-    if not added[k] < 0.2 * polygon_area(corners):
-        return corners
-    corners = corners.copy()
-    corners[k] += s[k] * a[k]
-    return np.delete(corners, (k + 1) % 5, 0)
-
-
-def polygon_area(corners: np.ndarray) -> float:
-    return abs(_signed_area(corners))
-
-
-def middle(corners: np.ndarray) -> np.ndarray:
-    """Where the diagonals of a quadrilateral (4, 2) meet: the image of a rectangle's centre, (2,)."""
-    a, b, gap = corners[2] - corners[0], corners[3] - corners[1], corners[1] - corners[0]
-    return corners[0] + a * ((gap[0] * b[1] - gap[1] * b[0]) / (a[0] * b[1] - a[1] * b[0]))
-
-
-def _signed_area(p: np.ndarray) -> float:
-    """Positive when clockwise as seen in an image (v down)."""
-    q = p[NEXT] if len(p) == 4 else np.roll(p, -1, 0)
-    return float(p[:, 0] @ q[:, 1] - p[:, 1] @ q[:, 0]) / 2
 
 
 @dc.dataclass(frozen=True)
@@ -311,7 +262,7 @@ def _outline_with_most_of(mask: np.ndarray, inside: np.ndarray, step: int) -> np
 def _judge(image: np.ndarray, region: Region, config: ColorSegmentationConfig) -> MarkerCandidate:
     """Judges the shape of a region."""
     low, high = region.contour.min(0), region.contour.max(0)
-    corners = quadrilateral(region.contour)
+    corners = quadrilateral.from_outline(region.contour)
     height, width = image.shape[:2]
     rejected, score = "", 0.0
     if region.area < config.min_area:
@@ -328,7 +279,7 @@ def _judge(image: np.ndarray, region: Region, config: ColorSegmentationConfig) -
         along = corners[NEXT] - corners
         sides = np.sqrt((along * along).sum(1)).tolist()
         # Half a pixel all round: the corners are pixel centres of the outline.
-        quad_area = polygon_area(corners) + sum(sides) / 2 + 1
+        quad_area = quadrilateral.polygon_area(corners) + sum(sides) / 2 + 1
         fill = min(region.area / quad_area, quad_area / region.area)
         # Blur rounds the corners of a small region.
         least = config.min_fill - min(1.5 / np.sqrt(region.area), 0.1)

@@ -14,13 +14,10 @@ from valve_drake.perception.color_segmentation import (
     Region,
     RegionConfig,
     green_regions,
-    middle,
-    polygon_area,
-    quadrilateral,
 )
-from valve_drake.perception.joint_fit import meet
-from valve_drake.perception.line_fitting import SidesConfig, fit_quads, side_lines
+from valve_drake.perception.line_fitting import SidesConfig, fit_quads
 from valve_drake.perception.marker import NEXT
+from valve_drake.perception.quadrilateral import from_outline, meet, middle, polygon_area, side_lines
 
 
 @dc.dataclass
@@ -67,7 +64,7 @@ def _judge(image: np.ndarray, region: Region, config: HandleMarkerConfig) -> Han
     last = np.array([image.shape[1], image.shape[0]]) - 1 - config.border
     if (low < config.border).any() or (high > last).any():
         return HandleMark(center=region.center, area=region.area, reason="border")
-    corners = quadrilateral(region.contour)
+    corners = from_outline(region.contour)
     if corners is None:
         return HandleMark(reason="corners: not four")
     sides = np.linalg.norm(corners[NEXT] - corners, axis=1)

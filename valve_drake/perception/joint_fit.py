@@ -19,8 +19,9 @@ import numpy as np
 
 from valve_drake.perception.edge_profiles import Sheet, Terms, moments, normal_cdf, normal_density
 from valve_drake.perception.marker import NEXT
+from valve_drake.perception.quadrilateral import BEFORE, meet
 
-_FOUR, _BEFORE = np.arange(4), np.array([3, 0, 1, 2])
+_FOUR = np.arange(4)
 NODES = (1 - 1 / np.sqrt(3)) / 2, (1 + 1 / np.sqrt(3)) / 2  # of a side's length, from its first corner
 # A side's own unknowns: two levels outside, two of the step, its shift, turn and bend, the blur. Common unknowns:
 # plane outside (3), plane of the step (3), four shifts (3 each), the blur; _COMMON (4, 8, 19) makes a side's of them.
@@ -234,17 +235,6 @@ def _corners(curves: Curves) -> np.ndarray:
     return meet(lines.reshape(-1, 4, 3))
 
 
-def meet(lines: np.ndarray) -> np.ndarray:
-    """Corners (..., 4, 2) of four sides (..., 4, 3): corner k is where sides k - 1 and k meet, NaN if they do not."""
-    x, y, z = lines[..., 0], lines[..., 1], lines[..., 2]
-    ax, ay, az = x[..., _BEFORE], y[..., _BEFORE], z[..., _BEFORE]
-    det = ax * y - ay * x
-    det = np.where(det == 0, np.nan, det)
-    out = np.empty((*det.shape, 2))
-    out[..., 0], out[..., 1] = (ay * z - az * y) / det, (az * x - ax * z) / det
-    return out
-
-
 def _corner_pixels(
     sheet: Sheet,
     curves: Curves,
@@ -260,7 +250,7 @@ def _corner_pixels(
     quads: the numbers of those looked at, in order.
     """
     corners = (4 * quads[:, None] + _FOUR).ravel()  # numbers among all 4 Q
-    before = (4 * quads[:, None] + _BEFORE).ravel()
+    before = (4 * quads[:, None] + np.array(BEFORE)).ravel()
     C = len(corners)
     u, v = np.rint(ends.reshape(-1, 2)[corners]).astype(int).T[:, :, None] + _WINDOW_PIXELS[:, None]  # (C, n)
     sides = curves[np.concatenate([corners, before])]  # those that begin at the corners, then those that end there

@@ -25,9 +25,10 @@ from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.config import Config, number, plain
 from valve_drake.messages import MarkerCandidate, MarkerEdges, QuadEdges, SegmentationPair
 from valve_drake.perception.edge_profiles import ROW, Sheet, Terms, gram, moments, normal_cdf, normal_density
-from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, basis, joint_fit, meet, sums
+from valve_drake.perception.joint_fit import PRIOR_POINTS, Curves, basis, joint_fit, sums
 from valve_drake.perception.marker import NEXT, Marker
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig, match, single, wrong_size
+from valve_drake.perception.matching import StereoPositioningConfig, match, single, wrong_size
+from valve_drake.perception.quadrilateral import meet, side_lines
 
 # 1, tau, rise, tau rise, bell, tau bell, and the grey value. A short side shows no trend: it is held near zero there.
 _LEVEL_TERMS = Terms((0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1), (4, 0))
@@ -211,32 +212,6 @@ def fit_quads(images: list[np.ndarray], corners: list[np.ndarray], config: Sides
                 raw = dc.replace(raw, bias=_CLIPPED_BIAS * max(raw.blur, _START_BLUR) * clips[q])
         out[k] = raw
     return out
-
-
-def side_lines(points: np.ndarray, side: np.ndarray, sides: int = 4) -> tuple[np.ndarray, float]:
-    """Total-least-squares lines: (sides, 3) with unit normals, l . (x, y, 1) = 0, and the rms distance of the points.
-
-    points (n, 2), side (n,) 0..sides - 1. A side without two points gives NaN.
-    """
-    middle = points.sum(0) / max(len(points), 1)
-    terms = np.empty((6, len(points)))
-    terms[0] = 1
-    x, y = np.subtract(points.T, middle[:, None], out=terms[1:3])
-    np.multiply(x, terms[1:3], out=terms[3:5])
-    np.multiply(y, y, out=terms[5])
-    n, sx, sy, sxx, sxy, syy = terms @ (np.asarray(side)[:, None] == np.arange(sides)).astype(float)
-    safe = np.maximum(n, 1)
-    mean_x, mean_y = sx / safe, sy / safe
-    xx, xy, yy = sxx - sx * mean_x, sxy - sx * mean_y, syy - sy * mean_y
-    angle = np.arctan2(2 * xy, xx - yy) / 2  # of the side's direction
-    lines = np.empty((sides, 3))
-    c, s = np.cos(angle), np.sin(angle)
-    lines[:, 0], lines[:, 1] = -s, c
-    lines[:, 2] = s * (mean_x + middle[0]) - c * (mean_y + middle[1])
-    square = float((s * s * xx - 2 * s * c * xy + c * c * yy).sum())
-    if n.min() < 2:
-        lines[n < 2] = np.nan
-    return lines, math.sqrt(max(square, 0.0) / max(len(points) - 2 * sides, 1))
 
 
 def _mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np.ndarray, float, np.ndarray]:

@@ -4,7 +4,7 @@ from valve_drake.camera.lens import StereoHead
 from valve_drake.messages import MarkerEdges, SegmentationPair
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import Marker
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig
+from valve_drake.perception.matching import StereoPositioningConfig
 from valve_drake.ports import Block, Inputs, Outputs
 
 

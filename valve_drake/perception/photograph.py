@@ -19,8 +19,9 @@ from valve_drake.messages import CameraFrame, QuadEdges, RectangleEstimate, Segm
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import NEXT, Marker
+from valve_drake.perception.matching import StereoPositioningConfig, epipolar_offset
+from valve_drake.perception.quadrilateral import corner_offset
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, estimate
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig, epipolar_offset, turn_between
 
 _SIDES = ("left", "right")
 _MOST_OTHERS = 8  # further rectangles that are looked for; each costs as much as the first
@@ -105,7 +106,7 @@ class _Stages:
                 each = zip(in_each, quads, lenses)
                 corners = [_fitted(P, quad, lens) if quad.found else None for P, quad, lens in each]
             elif len(corners) == 2 and corners[0] is not None and corners[1] is not None:
-                corners[1] = np.roll(corners[1], -turn_between(corners[0], corners[1]), axis=0)
+                corners[1] = np.roll(corners[1], -corner_offset(corners[0], corners[1]), axis=0)
         epipolar = float(np.linalg.norm(shift)) * head.right.focal()
         lens_px = 0.0
         if found.found:

@@ -30,11 +30,10 @@ from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.checks import require
 from valve_drake.config import Config, choice, number
 from valve_drake.messages import MarkerEdges, QuadEdges, RectangleEstimate
-from valve_drake.perception.color_segmentation import middle
-from valve_drake.perception.joint_fit import NODES, meet
-from valve_drake.perception.line_fitting import side_lines
+from valve_drake.perception.joint_fit import NODES
 from valve_drake.perception.marker import NEXT, Marker
-from valve_drake.perception.stereo_positioning import epipolar_offset, turn_between
+from valve_drake.perception.matching import epipolar_offset
+from valve_drake.perception.quadrilateral import corner_offset, meet, middle, side_lines, through_corners
 
 METHODS = ("refined", "paper")
 _PRUNE_CHI2 = 1000.0  # a start whose chi^2 is this much above the best one's is not refined
@@ -276,7 +275,7 @@ def _view(
     sigma = max(quad.sigma, config.min_sigma)
     if quad.information.any():
         corners, trust = quad.corners, np.ones(len(side))
-        lines = _joining(corners)
+        lines = through_corners(corners)
     else:
         robust, trust = _robust_lines(quad.points, side, sigma / lens.focal(), config)
         if robust is None:
@@ -306,16 +305,6 @@ def _view(
         trust=trust,
         information=quad.information * min(quad.sigma / sigma, 1) ** 2,
     )
-
-
-def _joining(corners: np.ndarray) -> np.ndarray:
-    """The lines (4, 3) of the sides between corners (4, 2), positive inside; unit normals."""
-    along = corners[NEXT] - corners
-    lines = np.empty((4, 3))
-    lines[:, 0], lines[:, 1] = -along[:, 1], along[:, 0]
-    lines[:, :2] /= np.sqrt((along * along).sum(1))[:, None]
-    lines[:, 2] = -(lines[:, :2] * corners).sum(1)
-    return lines
 
 
 def _robust_lines(
@@ -359,7 +348,7 @@ def _side_moments(
 
 def _aligned(left: _View, right: _View) -> _View:
     """The right view with its sides counted from the same corner as the left one's."""
-    turn = turn_between(left.corners, right.corners)
+    turn = corner_offset(left.corners, right.corners)
     if turn == 0:
         return right
     by_side = (right.lines, right.corners, right.scale, right.bias)

@@ -7,7 +7,8 @@ import numpy as np
 from valve_drake.camera.lens import StereoHead
 from valve_drake.messages import RobotState, SegmentationPair, StereoPosition
 from valve_drake.perception.marker import Marker
-from valve_drake.perception.stereo_positioning import StereoPositioningConfig, locate
+from valve_drake.perception.matching import StereoPositioningConfig
+from valve_drake.perception.stereo_positioning import locate
 from valve_drake.ports import Block, Inputs, Outputs
 
 
