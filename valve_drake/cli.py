@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.commands import (
     calibrate,
+    campaign,
     draw,
     estimate,
     experiment,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 COMMANDS = (
     run,
+    campaign,
     twin,
     scenario,
     draw,

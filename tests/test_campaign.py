@@ -1,0 +1,304 @@
+"""campaign: no run is lost or counted twice, a crash is a failure, and the numbers say what may be said."""
+
+import concurrent.futures
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from valve_drake import cli
+from valve_drake.campaign import campaign, comparison, executors, report, statistics, trial
+from valve_drake.campaign.campaign import Campaign
+from valve_drake.campaign.trial import Trial, perform, turned
+from valve_drake.checks import ConfigError
+
+# Stands for `valve-drake run`: it answers after a while, by its seed. It leaves a log, and a line of every run begun.
+FAKE = """
+import json, os, sys, time
+words = sys.argv[1:]
+seed, log = int(words[words.index("--seed") + 1]), words[words.index("--log") + 1]
+with open(os.environ["BEGUN"], "a") as file:
+    file.write(f"{seed}\\n")
+time.sleep(float(os.environ.get("TAKES", "0")))
+if seed == 13:
+    sys.exit("segmentation fault, or so")
+if seed == 14:
+    time.sleep(60)
+open(log, "wb").write(b"log")
+good = seed % 10 != 7
+numbers = {"outcome": "done" if good else "failed", "verdict": "turned" if good else "slip", "reason": "",
+    "mode_durations_s": {"search": 1.0, "turn": 2.0, "done" if good else "failed": 0.1}, "sim_time_s": 60.0,
+    "valve_angle_command_rad": 1.57, "valve_angle_true_rad": 1.56 if good else 0.5, "valve_angle_estimated_rad": 1.56,
+    "turn_peak_hand_force_N": 20.0 + seed, "wall_time_s": time.time(), "processor_s": {"total": 30.0 + seed}}
+print(json.dumps(numbers))
+"""
+
+
+@pytest.fixture
+def fake(tmp_path, monkeypatch):
+    """The file of runs that were begun."""
+    program = tmp_path / "fake.py"
+    program.write_text(FAKE)
+    monkeypatch.setattr(trial, "PROGRAM", (sys.executable, str(program)))
+    monkeypatch.setenv("BEGUN", str(tmp_path / "begun"))
+    return tmp_path / "begun"
+
+
+def run(wanted: Campaign, jobs: int = 4, **options):
+    with executors.executor("local", jobs) as pool:
+        return campaign.run(wanted, pool, **options)
+
+
+def wanted(out: Path, runs: int = 6, first: int = 1, **options) -> Campaign:
+    return Campaign(("simulated.scenario.yaml",), runs, first, (), out, **options)
+
+
+# ---------------------------------------------------------------- numbers
+
+
+@pytest.mark.parametrize(
+    "successes, trials, low, high",
+    [
+        (299, 299, 0.98774, 1.0),
+        (256, 256, 0.98569, 1.0),
+        (20, 20, 0.83157, 1.0),
+        (19, 20, 0.75127, 0.99873),
+        (0, 0, 0, 1),
+    ],
+)
+def test_the_interval_is_clopper_and_pearsons(successes, trials, low, high):
+    assert statistics.interval(successes, trials) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_mcnemars_exact_test_looks_at_the_seeds_that_differ_only():
+    assert statistics.mcnemar(0, 0) == 1.0
+    assert statistics.mcnemar(6, 0) == pytest.approx(2 * 0.5**6)
+    a, b = [True] * 50 + [False] * 6, [True] * 56
+    found = statistics.compare(a, b)
+    assert (found.both, found.better, found.worse, found.verdict) == (50, 6, 0, "better")
+    assert statistics.compare(b, a).verdict == "worse"
+
+
+def test_what_cannot_be_told_yet_says_how_many_runs_would_tell():
+    found = statistics.compare([True] * 17 + [False] * 3, [True] * 20)
+    assert found.verdict == "cannot tell yet" and found.p == 0.25
+    assert 15 <= found.more <= 25  # six of a kind tell: twice as many runs
+    assert statistics.compare([True, False], [False, True]).more is None
+
+
+def test_differences_come_with_students_interval():
+    found = statistics.difference([1.0, 2.0, 3.0, 4.0], [2.0, 3.0, 4.5, 4.5])
+    assert found.mean == pytest.approx(1.0) and found.low == pytest.approx(0.3504, abs=1e-3)
+    assert statistics.difference([1.0], [2.0]) is None
+
+
+# ---------------------------------------------------------------- running
+
+
+def test_every_trial_has_its_seed_its_draws_and_its_command(tmp_path):
+    trials = wanted(tmp_path, 3, 40).trials()
+    assert [t.seed for t in trials] == [40, 41, 42]
+    assert trials[0].command() == ["valve-drake", "run", "simulated.scenario.yaml", "--seed", "40"]
+    draws = [dict(t.draws) for t in trials]
+    assert "simulation.valve.friction" in draws[0] and draws[0] != draws[1]
+    assert draws == [dict(t.draws) for t in wanted(tmp_path, 3, 40).trials()]
+
+
+def test_a_campaign_leaves_a_record_a_run_and_the_logs_of_failures(tmp_path, fake):
+    records = run(wanted(tmp_path / "out", 6, 5))
+    assert [r["seed"] for r in records] == [5, 6, 7, 8, 9, 10]
+    assert [turned(r) for r in records] == [True, True, False, True, True, True]
+    assert records[2]["mode"] == "turn" and records[2]["verdict"] == "slip"
+    assert [path.name for path in (tmp_path / "out/logs").iterdir()] == ["simulated-7.mcap"]
+    assert records == campaign.read_all(tmp_path / "out") or sorted(r["seed"] for r in records) == [5, 6, 7, 8, 9, 10]
+    numbers = campaign.summary(records)
+    assert (numbers["runs"], numbers["turned"], numbers["processor_s_per_run"]) == (6, 5, pytest.approx(37.5))
+    assert [(f["seed"], f["verdict"], f["mode"]) for f in numbers["failures"]] == [(7, "slip", "turn")]
+
+
+@pytest.mark.parametrize("keep, kept", [("all", 3), ("failed", 1), ("none", 0)])
+def test_logs_are_kept_as_asked(tmp_path, fake, keep, kept):
+    run(wanted(tmp_path / "out", 3, 6, keep=keep))
+    assert len(list((tmp_path / "out/logs").glob("*.mcap"))) == kept
+
+
+def test_a_crash_and_a_time_out_are_failures_with_their_reason(tmp_path, fake):
+    crash, late = run(wanted(tmp_path / "out", 2, 13, time_out=2.0))
+    assert crash["outcome"] == "crashed" and "segmentation fault, or so" in crash["reason"]
+    assert late["outcome"] == "timed_out" and late["reason"] == "not ended after 2 s"
+    assert not turned(crash) and not turned(late)
+
+
+def test_a_second_call_runs_nothing_again_and_more_runs_go_on(tmp_path, fake):
+    first = run(wanted(tmp_path / "out", 4))
+    lines = []
+    again = run(wanted(tmp_path / "out", 6), say=lines.append)
+    assert again[:4] == first and "4 of 6 runs are there already" in lines[0]
+    assert sorted(map(int, fake.read_text().split())) == [1, 2, 3, 4, 5, 6]
+
+
+def test_records_are_equal_but_for_their_times(tmp_path, fake):
+    a, b = run(wanted(tmp_path / "a")), run(wanted(tmp_path / "b"), jobs=1)
+    assert [r | {"times": 0} for r in a] == [r | {"times": 0} for r in b]
+
+
+def test_jobs_run_at_the_same_time(tmp_path, fake, monkeypatch):
+    monkeypatch.setenv("TAKES", "1")
+    start = time.monotonic()
+    run(wanted(tmp_path / "out", 4), jobs=4)
+    assert time.monotonic() - start < 3.5
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from valve_drake.campaign import campaign, executors, trial
+trial.PROGRAM = (sys.executable, {program!r})
+with executors.executor("local", 2) as pool:
+    campaign.run(campaign.Campaign(("simulated.scenario.yaml",), 12, 1, (), Path({out!r})), pool)
+"""
+
+
+def test_killed_five_times_and_resumed_no_run_is_lost_or_counted_twice(tmp_path, fake, monkeypatch):
+    monkeypatch.setenv("TAKES", "0.3")
+    out = tmp_path / "out"
+    script = KILLED.format(program=str(tmp_path / "fake.py"), out=str(out))
+    counts = []
+    for _ in range(5):
+        process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(script)])
+        before = len(list((out / "records").glob("*.json"))) if out.exists() else 0
+        deadline = time.monotonic() + 30
+        while len(list((out / "records").glob("*.json"))) <= before and time.monotonic() < deadline:
+            time.sleep(0.02)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        counts.append(len(campaign.read_all(out)))
+    assert counts == sorted(counts) and counts[-1] < 12
+    time.sleep(0.5)  # runs of a killed campaign die with it
+    begun = len(fake.read_text().split())
+    time.sleep(0.5)
+    assert len(fake.read_text().split()) == begun
+    records = run(wanted(out, 12))
+    assert [r["seed"] for r in records] == list(range(1, 13)) == [r["seed"] for r in campaign.read_all(out)]
+
+
+def test_an_interrupt_ends_the_runs_that_are_under_way(tmp_path, fake, monkeypatch):
+    monkeypatch.setenv("TAKES", "20")
+
+    def interrupt(progress):
+        raise KeyboardInterrupt
+
+    start = time.monotonic()
+    monkeypatch.setattr(campaign.concurrent.futures, "wait", lambda *a, **k: interrupt(None))
+    with pytest.raises(KeyboardInterrupt):
+        run(wanted(tmp_path / "out", 4))
+    assert time.monotonic() - start < 10 and campaign.read_all(tmp_path / "out") == []
+
+
+# ---------------------------------------------------------------- refusals
+
+
+def test_a_folder_of_another_campaign_is_refused(tmp_path, fake):
+    run(wanted(tmp_path / "out", 1))
+    with pytest.raises(ConfigError, match="holds a campaign of other first seed"):
+        run(wanted(tmp_path / "out", 1, 2))
+    plan = json.loads((tmp_path / "out/campaign.json").read_text())
+    plan["versions"]["numpy"] = "1.0"
+    (tmp_path / "out/campaign.json").write_text(json.dumps(plan))
+    with pytest.raises(ConfigError, match=r"records of another program \(numpy 1.0 -> "):
+        run(wanted(tmp_path / "out", 1))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/letter.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="--out must be a new folder or that of a campaign"):
+        run(wanted(tmp_path / "mine", 1))
+
+
+def test_two_campaigns_do_not_share_a_folder(tmp_path, fake):
+    pool = concurrent.futures.ThreadPoolExecutor(1)
+
+    def second(progress):
+        with pytest.raises(ConfigError, match="a campaign is under way there"):
+            campaign.run(wanted(tmp_path / "out", 1), pool)
+
+    run(wanted(tmp_path / "out", 1), show=second)
+
+
+@pytest.mark.parametrize(
+    "words, error",
+    [
+        (["--runs", "0"], "--runs must be within 1 and 100000, got 0"),
+        (["--first-seed", "-1"], "--first-seed must be 0 or more"),
+        (["--jobs", "0"], "--jobs must be within 1 and 1024, got 0"),
+        (["--scheduler", "tcp://x"], "--scheduler goes with --backend dask"),
+        (["simulated.scenario.yaml", "simulated"], "two scenarios are called simulated"),
+        (["nothing.yaml"], "nothing.yaml"),
+        (["--time-out", "0"], "--time-out must be above 0"),
+        (["compare", "a"], "campaign compare takes the folders of two campaigns, got 1"),
+        (["compare", "a", "b"], "a: not the folder of a campaign"),
+    ],
+)
+def test_wrong_arguments_are_one_line(tmp_path, monkeypatch, capsys, words, error):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["campaign", *words]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and error in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------- pages and comparison
+
+
+def test_the_command_prints_the_numbers_and_writes_page_and_table(tmp_path, fake, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["campaign", "--runs", "3", "--first-seed", "6", "--out", "out", "--json"]) == 1  # seed 7 fails
+    numbers = json.loads(capsys.readouterr().out)
+    assert (numbers["runs"], numbers["turned"]) == (3, 2)
+    page = (tmp_path / "out/report.html").read_text()
+    assert "2 of 3 turned" in page and "--seed 7" in page and "simulated-7.mcap" in page
+    rows = (tmp_path / "out/runs.csv").read_text().splitlines()
+    assert len(rows) == 4 and rows[0].startswith("scenario,seed,outcome,verdict,mode,reason,")
+    assert cli.main(["runs", "out", "--json"]) == 0
+
+
+def test_compare_pairs_the_seeds_of_two_campaigns(tmp_path, fake):
+    run(wanted(tmp_path / "a", 10, 1))
+    run(wanted(tmp_path / "b", 10, 5))
+    found = comparison.compare(tmp_path / "a", tmp_path / "b")
+    assert (found["pairs"], found["turned_a"], found["turned_b"], found["better"], found["worse"]) == (6, 5, 5, 0, 0)
+    assert found["differences"]["turn_peak_hand_force_N"]["mean"] == 0.0
+    run(wanted(tmp_path / "c", 1, 100))
+    with pytest.raises(ConfigError, match="have no seed in common"):
+        comparison.compare(tmp_path / "a", tmp_path / "c")
+
+
+def test_the_report_holds_the_verdict_against_the_truth(tmp_path, fake):
+    records = run(wanted(tmp_path / "out", 3, 6))
+    assert report._false_verdicts(records) == {"known": 3, "false_turned": 0, "false_failure": 0}
+    records[0]["valve_angle_true_rad"] = 1.0  # it says turned, and is not
+    records[1]["valve_angle_true_rad"] = 1.57  # it says slip, and is turned
+    assert report._false_verdicts(records) == {"known": 3, "false_turned": 1, "false_failure": 1}
+
+
+def test_dask_gives_the_same_records(tmp_path, fake, monkeypatch):
+    pytest.importorskip("distributed")
+    local = run(wanted(tmp_path / "a", 4))
+    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
+    trials = wanted(tmp_path / "b", 4)
+    with executors.executor("dask", 2) as pool:
+        # Workers are processes of their own: the stand-in goes with the trial's function.
+        program = trial.PROGRAM
+        monkeypatch.setattr(campaign, "perform", lambda t: _performed(t, program))
+        there = campaign.run(trials, pool)
+    strip = [[r | {"times": 0} for r in records] for records in (local, there)]
+    assert strip[0] == strip[1]
+
+
+def _performed(one: Trial, program: tuple[str, ...]):
+    trial.PROGRAM = program
+    return perform(one)

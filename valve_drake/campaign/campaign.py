@@ -1,0 +1,249 @@
+"""A campaign: trials in a folder, one record a trial, that can be broken off at any time and goes on where it was.
+
+    OUT/campaign.json           what is run: scenarios, first seed, overrides, versions
+    OUT/records/NAME-SEED.json  one record a trial, written whole or not at all
+    OUT/logs/NAME-SEED.mcap     the logs that are kept
+
+A trial without a record has not been run: it is run again from its beginning, so that none is lost and none counts
+twice. Where the trials run is an executor's matter: threads that wait for processes here, or workers of Dask.
+"""
+
+import concurrent.futures
+import contextlib
+import dataclasses as dc
+import fcntl
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from valve_drake import config, outputs, scenario
+from valve_drake.campaign.statistics import interval
+from valve_drake.campaign.trial import Record, Trial, perform, turned
+from valve_drake.checks import ConfigError, require
+from valve_drake.config import Uniform
+from valve_drake.runner import versions
+
+PLAN, RECORDS, LOGS = "campaign.json", "records", "logs"
+KEEP = ("all", "failed", "none")  # logs
+SAMPLE = 50  # of the turned runs, the log of every so many'th seed is kept as well, unless none are
+MOST = 100_000  # runs of one campaign
+
+
+@dc.dataclass(frozen=True)
+class Campaign:
+    """What is run. scenarios: names or files, each with seeds first_seed .. first_seed + runs - 1."""
+
+    scenarios: tuple[str, ...]
+    runs: int
+    first_seed: int
+    overrides: tuple[str, ...]
+    out: Path
+    keep: str = "failed"
+    time_out: float = 900.0  # of one run, by the wall's clock [s]
+
+    def trials(self) -> list[Trial]:
+        """All of them, in order. Raises ConfigError for a wrong scenario, or two with one name."""
+        require(1 <= self.runs <= MOST, "--runs", f"within 1 and {MOST}", self.runs)
+        last = self.first_seed + self.runs - 1
+        require(
+            0 <= self.first_seed and last < 2**31, "--first-seed", "0 or more, the last below 2^31", self.first_seed
+        )
+        names = [name_of(path) for path in self.scenarios]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ConfigError(f"campaign: two scenarios are called {twice}: their records would be one")
+        trials = []
+        for name, path in zip(names, self.scenarios):
+            given = scenario.load(path, self.overrides)
+            for seed in range(self.first_seed, self.first_seed + self.runs):
+                log = (self.out / LOGS / f"{name}-{seed}.mcap").resolve()
+                draws = drawn(dc.replace(given, seed=seed))
+                trials.append(Trial(name, path, seed, self.overrides, draws, log, self.time_out))
+        return trials
+
+
+def name_of(path: str) -> str:
+    """A scenario's name: its file without folder and suffixes."""
+    return Path(path).name.split(".")[0]
+
+
+def drawn(given: scenario.Scenario) -> tuple[tuple[str, float], ...]:
+    """What the seed draws: key and value of every distribution of a scenario."""
+    resolved = {leaf.key: leaf.value for leaf in config.leaves(scenario.resolve(given))}
+    return tuple((leaf.key, resolved[leaf.key]) for leaf in config.leaves(given) if isinstance(leaf.value, Uniform))
+
+
+@dc.dataclass
+class Progress:
+    """What a display shows after each trial."""
+
+    done: int
+    total: int
+    turned: int
+
+    @property
+    def low(self) -> float:
+        """Lower bound of the success rate, at 95 %."""
+        return interval(self.turned, self.done)[0]
+
+
+def run(
+    campaign: Campaign,
+    executor: concurrent.futures.Executor,
+    show: Callable[[Progress], None] = lambda progress: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> list[Record]:
+    """Runs what has no record yet -> all records, in the order of the trials.
+
+    Raises ConfigError if the folder holds another campaign, or one that is under way.
+    """
+    trials = campaign.trials()
+    with _claimed(campaign, say):
+        records = {trial.key: record for trial in trials if (record := read(campaign.out, trial)) is not None}
+        if records:
+            say(f"{len(records)} of {len(trials)} runs are there already")
+        progress = Progress(len(records), len(trials), sum(map(turned, records.values())))
+        left = iter([trial for trial in trials if trial.key not in records])
+        show(progress)
+        waiting: dict[concurrent.futures.Future[Record], Trial] = {}
+        try:
+            # As many as may wait at a time: a campaign that is broken off leaves little behind.
+            while True:
+                for trial in left:
+                    waiting[executor.submit(perform, trial)] = trial
+                    if len(waiting) >= 256:
+                        break
+                if not waiting:
+                    break
+                done, _ = concurrent.futures.wait(waiting, return_when=concurrent.futures.FIRST_COMPLETED)
+                for future in done:
+                    trial = waiting.pop(future)
+                    record = finished(campaign, trial, future.result())
+                    records[trial.key] = record
+                    progress = Progress(progress.done + 1, progress.total, progress.turned + turned(record))
+                    show(progress)
+        except BaseException:
+            for future in waiting:
+                future.cancel()
+            raise
+    return [records[trial.key] for trial in trials]
+
+
+def finished(campaign: Campaign, trial: Trial, record: Record) -> Record:
+    """Keeps the log or not, and writes the record: from then on the trial counts."""
+    keep = campaign.keep == "all" or (campaign.keep == "failed" and (not turned(record) or trial.seed % SAMPLE == 0))
+    if not keep:
+        for path in (trial.log, trial.log.with_suffix(".json")):
+            with contextlib.suppress(FileNotFoundError):
+                path.unlink()
+    record = record | {"log": f"{LOGS}/{trial.log.name}" if keep and trial.log.exists() else None}
+    outputs.write(record_path(campaign.out, trial), json.dumps(record, indent=1) + "\n")
+    return record
+
+
+def record_path(out: Path, trial: Trial) -> Path:
+    return out / RECORDS / f"{trial.key}.json"
+
+
+def read(out: Path, trial: Trial) -> Record | None:
+    """The record of a trial; None if there is none. Raises ConfigError for a file that is no record of it."""
+    path = record_path(out, trial)
+    try:
+        record = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        raise ConfigError(f"{path}: not a record of a campaign; remove it, and the trial is run again") from None
+    if not isinstance(record, dict) or (record.get("scenario"), record.get("seed")) != (trial.name, trial.seed):
+        raise ConfigError(f"{path}: not the record of {trial.key}; remove it, and the trial is run again")
+    return record
+
+
+def read_all(out: Path) -> list[Record]:
+    """All records of a campaign's folder, by scenario and seed. Raises ConfigError unless it is one."""
+    plan(out)
+    records = []
+    for path in (out / RECORDS).glob("*.json"):
+        try:
+            record = json.loads(path.read_bytes())
+            record["scenario"], record["seed"], record["outcome"]
+        except (ValueError, KeyError, TypeError):
+            raise ConfigError(f"{path}: not a record of a campaign") from None
+        records.append(record)
+    return sorted(records, key=lambda record: (record["scenario"], record["seed"]))
+
+
+def plan(out: Path) -> dict[str, Any]:
+    """What a campaign's folder says that it is. Raises ConfigError."""
+    try:
+        found = json.loads((out / PLAN).read_bytes())
+        found["scenarios"], found["versions"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"{out}: not the folder of a campaign (it has no {PLAN})") from None
+    assert isinstance(found, dict)
+    return found
+
+
+@contextlib.contextmanager
+def _claimed(campaign: Campaign, say: Callable[[str], None]) -> Iterator[None]:
+    """The folder is this campaign's, and nobody else's meanwhile."""
+    out = campaign.out
+    wanted = {
+        "scenarios": {
+            name_of(path): scenario.dump(scenario.load(path, campaign.overrides)) for path in campaign.scenarios
+        },
+        "first_seed": campaign.first_seed,
+        "overrides": list(campaign.overrides),
+        "versions": versions(),
+    }
+    if out.exists() and not (out / PLAN).exists() and any(out.iterdir()):
+        raise ConfigError(f"--out must be a new folder or that of a campaign, got {str(out)!r}")
+    for folder in (out / RECORDS, out / LOGS):
+        outputs.make_folder(folder)
+    lock = os.open(out / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ConfigError(f"--out {str(out)!r}: a campaign is under way there") from None
+        if (out / PLAN).exists():
+            _same(plan(out), wanted, out, say)
+        else:
+            outputs.write(out / PLAN, json.dumps(wanted, indent=1) + "\n")
+        yield
+    finally:
+        os.close(lock)
+
+
+def _same(there: dict[str, Any], wanted: dict[str, Any], out: Path, say: Callable[[str], None]) -> None:
+    """Refuses to go on with another campaign: its records would be mixed with this one's."""
+    for key in ("scenarios", "first_seed", "overrides"):
+        if there.get(key) != wanted[key]:
+            raise ConfigError(
+                f"--out {str(out)!r} holds a campaign of other {key.replace('_', ' ')}: choose another folder"
+            )
+    changed = [k for k, v in wanted["versions"].items() if there["versions"].get(k) != v]
+    if changed:
+        words = ", ".join(f"{k} {there['versions'].get(k)} -> {wanted['versions'][k]}" for k in changed)
+        raise ConfigError(f"--out {str(out)!r} holds records of another program ({words}): choose another folder")
+
+
+def failures(records: Sequence[Record]) -> list[Record]:
+    return [record for record in records if not turned(record)]
+
+
+def summary(records: Sequence[Record]) -> dict[str, Any]:
+    """The object of `campaign --json`."""
+    count = sum(map(turned, records))
+    spent = [t["total"] for r in records if (t := r["times"].get("processor_s"))]
+    return {
+        "runs": len(records),
+        "turned": count,
+        "interval_95": list(interval(count, len(records))),
+        "failures": [
+            {k: r[k] for k in ("scenario", "seed", "verdict", "mode", "outcome", "reason")} for r in failures(records)
+        ],
+        "processor_s_per_run": sum(spent) / len(spent) if spent else None,
+    }

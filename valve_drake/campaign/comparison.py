@@ -1,0 +1,43 @@
+"""Two campaigns on the same seeds: does one program turn more valves than the other?"""
+
+import dataclasses as dc
+from pathlib import Path
+from typing import Any
+
+from valve_drake.campaign import campaign, statistics
+from valve_drake.campaign.trial import turned
+from valve_drake.checks import ConfigError
+
+FIGURES = {
+    "turn_peak_hand_force_N": lambda r: r.get("turn_peak_hand_force_N"),
+    "turn_mean_stem_force_N": lambda r: r.get("turn_mean_stem_force_N"),
+    "sim_time_s": lambda r: r.get("sim_time_s"),
+    "processor_s": lambda r: (r["times"].get("processor_s") or {}).get("total"),
+}
+
+
+def compare(a: Path, b: Path) -> dict[str, Any]:
+    """The object of `compare --json`: pairs of runs by scenario and seed. Raises ConfigError without pairs."""
+    one, other = ({(r["scenario"], r["seed"]): r for r in campaign.read_all(folder)} for folder in (a, b))
+    keys = sorted(one.keys() & other.keys())
+    if not keys:  # their scenarios may be called differently
+        one, other = ({seed: r for (_, seed), r in records.items()} for records in (one, other))
+        keys = sorted(one.keys() & other.keys())
+    if not keys:
+        raise ConfigError(f"compare: {a} and {b} have no seed in common")
+    pairs = [(one[key], other[key]) for key in keys]
+    found = statistics.compare([turned(r) for r, _ in pairs], [turned(r) for _, r in pairs])
+    differences = {}
+    for name, figure in FIGURES.items():
+        both = [(figure(r), figure(s)) for r, s in pairs if turned(r) and turned(s)]
+        both = [(x, y) for x, y in both if x is not None and y is not None]
+        difference = statistics.difference([x for x, _ in both], [y for _, y in both])
+        if difference is not None:
+            differences[name] = dc.asdict(difference)
+    return {
+        "pairs": len(pairs),
+        "turned_a": sum(turned(r) for r, _ in pairs),
+        "turned_b": sum(turned(r) for _, r in pairs),
+        **dc.asdict(found),
+        "differences": differences,
+    }

@@ -1,0 +1,145 @@
+"""One trial: a run of a scenario with a seed in a fresh process, and the record of what it came to.
+
+A record is a plain JSON object. What depends on the machine stands in its `times`, so that two records of one program,
+scenario and seed are equal but for that.
+"""
+
+import ctypes
+import dataclasses as dc
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, TypeAlias
+
+Record: TypeAlias = dict[str, Any]
+
+PROGRAM = (sys.executable, "-m", "valve_drake")
+# Outcomes beside those of a run: its process died, did not end, or it ended at its time limit.
+CRASHED, TIMED_OUT, UNFINISHED = "crashed", "timed_out", "unfinished"
+_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
+_LIBC = ctypes.CDLL(None)
+_running: "set[subprocess.Popen[bytes]]" = set()  # in this process
+# Taken over from `run --json` as they are; those of `_TIMES` depend on the machine.
+_FIGURES = (
+    "sim_time_s", "valve_angle_command_rad", "valve_angle_estimated_rad", "valve_angle_hands_rad",
+    "valve_angle_true_rad", "peak_hand_force_N", "turn_peak_hand_force_N", "turn_mean_hand_force_N",
+    "turn_mean_stem_force_N", "turn_share_left",
+)  # fmt: skip
+_TIMES = ("wall_time_s", "real_time_factor", "processor_s")
+
+
+@dc.dataclass(frozen=True)
+class Trial:
+    """scenario: a file, or a name in diagrams/. draws: the resolved values of its distributions, by key."""
+
+    name: str  # of the scenario, without folder and suffixes
+    scenario: str
+    seed: int
+    overrides: tuple[str, ...]
+    draws: tuple[tuple[str, float], ...]
+    log: Path
+    time_out: float  # of the wall clock [s]
+
+    @property
+    def key(self) -> str:
+        """Names the trial within its campaign."""
+        return f"{self.name}-{self.seed}"
+
+    def command(self) -> list[str]:
+        """What a user would type to run it again."""
+        given = [word for override in self.overrides for word in ("--set", override)]
+        return ["valve-drake", "run", self.scenario, "--seed", str(self.seed), *given]
+
+
+def perform(trial: Trial) -> Record:
+    """Runs a trial to its end -> its record. A crash and a time-out are records, too: failures with their reason."""
+    program = [*PROGRAM, *trial.command()[1:]]
+    options = ["--no-html", "--json", "--overwrite", "--log", str(trial.log)]
+    began = time.monotonic()
+    process = subprocess.Popen(
+        program + options,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,  # one signal reaches the run and its image processes, and Ctrl-C none of them
+        preexec_fn=_die_with_parent,
+    )
+    late = False
+    _running.add(process)
+    try:
+        out, errors = process.communicate(timeout=trial.time_out)
+    except subprocess.TimeoutExpired:
+        late = True
+        _kill(process)
+        out, errors = process.communicate()
+    except BaseException:
+        _kill(process)
+        raise
+    finally:
+        _running.discard(process)
+    wall = time.monotonic() - began
+    record = _begun(trial)
+    numbers = None if late else _numbers(out)
+    if numbers is None:
+        lines = errors.decode("utf-8", "replace").strip().splitlines()
+        said = lines[-1][:300] if lines else "it said nothing"
+        reason = f"not ended after {trial.time_out:g} s" if late else f"exit code {process.returncode}: {said}"
+        record |= {"outcome": TIMED_OUT if late else CRASHED, "reason": reason}
+        return record | {"times": {"wall_time_s": wall}}
+    record |= {key: numbers[key] for key in ("outcome", "verdict", "reason")}
+    record["outcome"] = record["outcome"] or UNFINISHED
+    modes = list(numbers["mode_durations_s"])
+    reached = [mode for mode in modes if mode != numbers["outcome"]]
+    record |= {"mode": reached[-1] if reached else "", "mode_durations_s": numbers["mode_durations_s"]}
+    record |= {key: numbers.get(key) for key in _FIGURES}
+    return record | {"times": {key: numbers.get(key) for key in _TIMES}}
+
+
+def _begun(trial: Trial) -> Record:
+    """A record with what is known before the run."""
+    return {
+        "scenario": trial.name,
+        "seed": trial.seed,
+        "command": trial.command(),
+        "draws": dict(trial.draws),
+        "outcome": "",
+        "verdict": "",
+        "reason": "",
+        "mode": "",  # the last one before the end
+    }
+
+
+def turned(record: Record) -> bool:
+    """Whether a trial is a success."""
+    return record["outcome"] == "done" and record["verdict"] == "turned"
+
+
+def _numbers(out: bytes) -> dict[str, Any] | None:
+    """The object that `run --json` prints; None if there is none."""
+    try:
+        numbers = json.loads(out)
+    except ValueError:
+        return None
+    return numbers if isinstance(numbers, dict) and "outcome" in numbers else None
+
+
+def _die_with_parent() -> None:
+    """In the child: if this program is killed, so is the run; a resumed campaign does not find it still writing."""
+    _LIBC.prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+
+
+def break_off() -> None:
+    """Ends all trials that this process is waiting for; their records are of no use."""
+    for process in tuple(_running):
+        _kill(process)
+
+
+def _kill(process: "subprocess.Popen[bytes]") -> None:
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
