@@ -23,6 +23,8 @@ from valve_drake.perception.color_segmentation_system import ColorSegmentationSy
 from valve_drake.ports import SLOT, TICK
 from valve_drake.recording.reader import LogReader
 from valve_drake.stations.bus import BadMessage, Bus
+from valve_drake.stations.camera_rate import CameraRate, limits
+from valve_drake.stations.camera_rig import Capture
 from valve_drake.stations.contract import CAMERAS, CONTRACT
 from valve_drake.stations.faults import FaultConfig, Faults, Wire
 from valve_drake.stations.hardware import RobotLink
@@ -39,7 +41,7 @@ from valve_drake.stations.lcm_channels import (
     HardwareConfig,
 )
 from valve_drake.stations.reports import Senders
-from valve_drake.stations.twin import Guard
+from valve_drake.stations.twin import Guard, RobotClock
 
 BASE = CHANNELS["base.command"]
 ARM = "left_arm.position_command"
@@ -353,6 +355,59 @@ def test_a_twin_that_lives_by_the_clock_sends_the_images_that_are_asked_for_and_
     assert 0 < seen[0].seq < seen[1].seq and seen[0].utime > 0
 
 
+class SlowImages(rehearsal.LiveImages):
+    """Images that never come."""
+
+    def _ask(self, name, capture):
+        self._asked[name][capture.sequence] = capture
+
+    def _receive_all(self):
+        pass
+
+
+def test_images_are_begun_as_seldom_as_the_rate_allows_and_of_both_eyes():
+    begun, images = [], SlowImages()
+    images.wanted, images.period = {"head_left", "head_right"}, lambda camera: 0.25
+    for k in range(1, 9):
+        for camera in CAMERAS:
+            images.captured(camera, Capture(k * 0.125, k, np.zeros(1)))
+        for camera in CAMERAS:  # what was begun is there at once
+            begun += [(camera, sequence) for sequence in images._asked[camera]]
+            images._asked[camera].clear()
+    assert begun == [(eye, k) for k in (1, 3, 5, 7) for eye in ("head_left", "head_right")]
+
+
+def test_an_image_that_takes_too_long_is_named_before_the_camera_looks_dead(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr("valve_drake.stations.twin.wall.monotonic", lambda: clock[0])
+    scenario = scenarios.resolve(near("hardware.lockstep=false"))
+    lcm, faults = DrakeLcm("memq://"), []
+    rate = CameraRate(limits(scenario.simulation.camera, scenario.supervisor.max_age), lambda line: None)
+    bus = Bus(scenario.hardware, lcm)
+    bus.listen(ROBOT, lambda key, message: faults.append(message.coord) if key == STATE else None)
+    twin = rehearsal.make_twin(scenario, workers=SlowImages(), rate=rate, lcm=lcm)
+    while twin.time < 1.0:
+        bus.say(REQUEST, 0, dict.fromkeys(CAMERAS, 1.0))
+        clock[0] += TICK
+        twin.hear()
+        twin.report()
+        twin.move()
+        while bus.pump():
+            pass
+    words = "the twin has needed more than 0.65 s for an image of "
+    slow = [any(name.startswith(words) for name in names) for names in faults]
+    first = slow.index(True) * scenario.hardware.robot_period
+    assert all(slow[slow.index(True) :]) and first < scenario.supervisor.max_age["head_left"] - 0.1
+
+
+def test_the_twins_clock_runs_on_when_its_time_does_not():
+    clock = RobotClock()
+    clock.fell_behind(1.0, 0.0)
+    clock.fell_behind(2.0, 0.1)
+    clock.fell_behind(3.0, 0.4)
+    assert [clock.at(t) for t in (0.5, 1.99, 2.0, 2.5, 3.0, 4.0)] == pytest.approx([0.5, 1.99, 2.1, 2.6, 3.4, 4.4])
+
+
 def test_in_lock_step_the_twin_ends_when_the_program_has_fallen_silent(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("valve_drake.stations.twin.wall.monotonic", lambda: clock[0])
@@ -427,6 +482,14 @@ def test_a_command_said_again_counts_as_none(commanded):
     c.drive((10_000, 0.5))  # a program that began anew
     c.drive((20_000, 0.5))
     assert c.told == 0.5
+
+
+def test_the_stamps_of_a_slow_twin_are_of_the_walls_clock():
+    c = Commanded()
+    c.tick(8)
+    c.twin.fell_behind(0.25)
+    c.tick(4)
+    assert c.state["state"].timestamp == pytest.approx(1e6 * (c.twin.time + 0.25), abs=5e6 * TICK)
 
 
 def test_a_second_programs_commands_are_refused_by_their_stamps_and_reported(commanded):

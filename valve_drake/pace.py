@@ -65,6 +65,11 @@ class Pacer:
             self._lost += end - self.due
             self.due = end
 
+    @property
+    def lost(self) -> float:
+        """By how much the loop is behind the wall's clock [s]."""
+        return self._lost
+
     def wait(self, until: float) -> None:
         """Until the wall's clock says so."""
         while (left := until - wall.monotonic()) > 0:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses as dc
+import functools
 import gc
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -13,8 +14,10 @@ from valve_drake.console import complain
 from valve_drake.diagram import initial_commands, make_station, rig_of
 from valve_drake.pace import Pace, Pacer
 from valve_drake.ports import SLOT
+from valve_drake.processor import goes_first
 from valve_drake.scenario import Scenario, resolve
 from valve_drake.stations.bus import Bus
+from valve_drake.stations.camera_rate import CameraRate, limits
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.faults import Faults
 from valve_drake.stations.hardware import RobotLink
@@ -30,6 +33,7 @@ class Rehearsed:
     valve_start: float  # opened since closed [rad]
     valve_end: float
     pace: Pace | None
+    slowest_cameras: int  # by which factor they were slowed down, at most
     dropped: Mapping[str, int]  # bad messages, by what they were for
 
     def as_json(self) -> dict[str, Any]:
@@ -41,12 +45,20 @@ class Rehearsed:
             "valve_end_rad": self.valve_end,
             "missed_ticks": self.pace and self.pace.missed,
             "ticks": self.pace and self.pace.ticks,
+            "lost_s": self.pace and self.pace.lost,
+            "cameras_slowed_by": self.slowest_cameras,
             "dropped_messages": dict(self.dropped),
         }
 
 
-def make_twin(scenario: Scenario, *, workers: CameraWorkers | None = None, lcm: DrakeLcm | None = None) -> Twin:
-    """The twin of a resolved scenario. workers: make its images; LiveImages are needed to keep real time."""
+def make_twin(
+    scenario: Scenario,
+    *,
+    workers: CameraWorkers | None = None,
+    rate: CameraRate | None = None,
+    lcm: DrakeLcm | None = None,
+) -> Twin:
+    """The twin of a resolved scenario. workers: make its images; LiveImages, and their rate, to keep real time."""
     station = make_station(dc.replace(scenario, station="simulated"), workers=workers)
     return Twin(
         station,
@@ -55,6 +67,7 @@ def make_twin(scenario: Scenario, *, workers: CameraWorkers | None = None, lcm: 
         scenario.simulation.camera,
         Faults(scenario.faults, scenario.seed),
         images=workers if isinstance(workers, LiveImages) else None,
+        rate=rate,
         lcm=lcm,
     )
 
@@ -87,8 +100,9 @@ def run_twin(
     scenario.check()
     cv2.setNumThreads(1)
     lockstep = scenario.hardware.lockstep
+    rate = CameraRate(limits(scenario.simulation.camera, scenario.supervisor.max_age), notice)
     with (CameraWorkers if lockstep else LiveImages)(*rig_of(scenario)) as workers:
-        twin = make_twin(scenario, workers=workers)
+        twin = make_twin(scenario, workers=workers, rate=rate)
         begin = float(twin.read("truth.valve_angle")[0])
         if isinstance(workers, LiveImages):
             workers.settle(stop, notice)
@@ -96,20 +110,22 @@ def run_twin(
         pacer = None if lockstep else Pacer(idle=twin.pass_time)
         gc.collect()
         gc.freeze()
-        while not (stop() or twin.gone or (duration is not None and twin.time >= duration)):
-            show(twin.time)
-            if pacer is None:
-                twin.wait()
-            else:
-                pacer.tick(lambda: _tick(twin, pacer))
+        with goes_first(0 if lockstep else scenario.hardware.priority):
+            while not (stop() or twin.gone or (duration is not None and twin.time >= duration)):
+                show(twin.time)
+                if pacer is None:
+                    twin.wait()
+                else:
+                    pacer.tick(functools.partial(_tick, twin, pacer))
         if twin.dropped:
             notice(f"bad messages of the program were dropped: {listed(twin.dropped)}")
         end = float(twin.read("truth.valve_angle")[0])
-        return Rehearsed(twin.time, begin, end, pacer.report(twin.time) if pacer else None, twin.dropped)
+        return Rehearsed(twin.time, begin, end, pacer.report(twin.time) if pacer else None, rate.largest, twin.dropped)
 
 
 def _tick(twin: Twin, pacer: Pacer) -> None:
     """Reports, gives the program until slot 3 to answer, moves."""
+    twin.fell_behind(pacer.lost)
     twin.report()
     pacer.wait(pacer.due + 3 * SLOT)
     twin.hear()

@@ -34,6 +34,7 @@ from valve_drake.messages import Mode, ModeState, OperatorCommand, Verdict
 from valve_drake.pace import PACE, Pace, Pacer
 from valve_drake.player import Player
 from valve_drake.ports import SLOT, TICK
+from valve_drake.processor import goes_first
 from valve_drake.recording import layout
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recorder_system import RecorderSystem, Sink, Tee
@@ -218,7 +219,8 @@ def run(
                 say(writer.error)
 
         try:
-            mode = _advance(system, simulator, scenario, duration, go, link, watch, stop, begin)
+            with goes_first(scenario.hardware.priority if paced else 0):
+                mode = _advance(system, simulator, scenario, duration, go, link, watch, stop, begin)
         except OperationFailed as error:
             if writer.empty:
                 raise

@@ -200,7 +200,7 @@ def _serve_copy(rig: CameraRig, fd: int, mine: Sequence[multiprocessing.connecti
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     for wire in mine:
         wire.close()
-    os.setsid()
+    os.setpgid(0, 0)  # a terminal's signals are for the run; in its session Linux weighs both by their niceness
     gc.freeze()  # what was copied stays shared
     serve(fd, rig)
 
@@ -211,7 +211,7 @@ def _spawn(fd: int) -> tuple[subprocess.Popen[bytes], Callable[[], int]]:
     process = subprocess.Popen(
         [sys.executable, "-c", code],
         pass_fds=[fd],
-        start_new_session=True,  # a terminal's signals are for the run, which decides when this ends
+        process_group=0,  # as in _serve_copy
     )
     return process, process.wait
 

@@ -29,6 +29,7 @@ from valve_drake.checks import require
 from valve_drake.config import Config, number, numbers, plain, texts
 from valve_drake.messages import POSE_HISTORY, SIDES, CameraFrame, Mode
 from valve_drake.ports import SLOT, TICK
+from valve_drake.processor import HIGHEST
 from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.network import LOOPBACK, NAME, group_of
 
@@ -311,6 +312,9 @@ class HardwareConfig(Config):
     command_age: float = number(0.1, 0.02, 0.1, "on the robot: without commands for longer its joints stop [s]")
     robot_period: float = number(1 / 32, TICK, 1 / 32, "of robot.state [s]")
     request_period: float = number(1 / 32, TICK, 0.25, "of cameras.request [s]")
+    priority: int = number(
+        10, 0, HIGHEST, "of a paced loop before the machine's other programs, where the system permits; 0: as they are"
+    )
 
     def relations(self, key: str) -> None:
         group_of(self.lcm_url)

@@ -61,6 +61,9 @@ class CameraConfig(Config):
     )
     head_period: float = number(0.125, 1 / 32, 2.0, "between two captures of a head camera [s]")
     wrist_period: float = number(0.0625, 1 / 32, 2.0, "between two captures of a wrist camera [s]")
+    slowest_period: float = number(
+        0.25, 1 / 32, 0.5, "to which a twin slows its cameras down when it cannot keep real time [s]"
+    )
     latency: float = number(
         0.0625, 0.0, 0.5, "from the capture to the image being there: exposure, compression, wire [s]"
     )

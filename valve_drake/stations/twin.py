@@ -13,6 +13,8 @@ All but the stop are reported as faults, the stop as such. The twin's time is it
 lock-step with the program.
 """
 
+import bisect
+import dataclasses as dc
 import math
 import os
 import time as wall
@@ -27,7 +29,9 @@ from pydrake.systems.framework import Diagram
 from valve_drake.messages import CameraFrame
 from valve_drake.motion import slew
 from valve_drake.ports import SLOT, TICK
+from valve_drake.processor import YIELDING
 from valve_drake.stations.bus import BadMessage, Bus
+from valve_drake.stations.camera_rate import SECOND, CameraRate
 from valve_drake.stations.camera_rig import Capture
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, CONTRACT, MATE
@@ -71,6 +75,7 @@ BACK = 0.3  # speed of a joint that was stopped, back to its commands [rad/s]
 GONE = 3.0  # paced: a program that was silent for this long counts as gone; raise it for a slow one [s]
 IDLE = 0.05  # lock-step: time between two reports before the start [s, wall clock]
 PATIENCE = {"cameras": 0.1, "controller": math.inf}  # of what does not come every tick (reports.py) [s]
+MARGIN = 0.1  # a late image is reported so long before the program would call its camera dead [s]
 STARTING = 3.0  # the user is told if the first images take longer than this [s, wall clock]
 
 
@@ -80,7 +85,11 @@ class LiveImages(CameraWorkers):
     def __init__(self, *rig: Any) -> None:
         super().__init__(*rig)
         self.wanted: set[str] = set()
+        self.period: Callable[[str], float] = lambda camera: 0.0  # between two images [s]; less: as the camera captures
         self._unmade = set(CAMERAS)  # cameras whose first image, which is made unasked, is not there yet
+        self._last = dict.fromkeys(CAMERAS, -math.inf)  # capture of the last image that was begun [s]
+        self._begun: dict[str, float] = {}  # [s, wall]
+        self._took: dict[str, list[float]] = {camera: [] for camera in CAMERAS}
 
     def settle(self, stop: Callable[[], bool], notice: Callable[[str], None]) -> None:
         """Waits for the first images, which take a renderer seconds, or until `stop`. notice: tells the user."""
@@ -92,26 +101,48 @@ class LiveImages(CameraWorkers):
                 told = True
                 missing = ", ".join(camera for camera in CAMERAS if camera in self._unmade)
                 notice(f"the twin waits for its renderers: no image yet of {missing}")
-        if hasattr(os, "SCHED_IDLE"):  # Linux: a late image is better than a late tick of either side
-            for worker in self._workers:
-                os.sched_setscheduler(worker.pid, os.SCHED_IDLE, os.sched_param(0))
+        for worker in self._workers:  # a late image is better than a late tick of either side
+            os.setpriority(os.PRIO_PROCESS, worker.pid, YIELDING)
 
     def captured(self, name: str, capture: Capture) -> None:
         # A camera that cannot keep up drops images; the two of a pair drop the same ones.
-        free = not self._asked[name] | self._asked[MATE[name]]
-        if capture.sequence == 0 or (name in self.wanted and (capture.sequence in self._asked[MATE[name]] or free)):
+        mate = MATE[name]
+        free = not self._asked[name] | self._asked[mate]
+        due = capture.time - max(self._last[name], self._last[mate]) > self.period(name) - TICK
+        if capture.sequence == 0 or (name in self.wanted and (capture.sequence in self._asked[mate] or (free and due))):
+            self._last[name] = capture.time
+            self._begun[name] = wall.monotonic()
             self._ask(name, capture)
 
     def ready(self) -> list[CameraFrame]:
         """Those that came since the last call."""
         self._receive_all()
         frames = list(self._made.values())
+        now = wall.monotonic()
         for frame in frames:
             del self._asked[frame.camera][frame.sequence]
+            self._took[frame.camera].append(now - self._begun[frame.camera])
             if frame.sequence == 0:
                 self._unmade.discard(frame.camera)
         self._made.clear()
         return [frame for frame in frames if frame.sequence > 0]
+
+    def took(self) -> dict[str, float]:
+        """By camera, the mean time that an image took since the last call, or so far if none came [s, wall]."""
+        now, took = wall.monotonic(), {}
+        for camera, times in self._took.items():
+            if times:
+                took[camera] = sum(times) / len(times)
+            elif self._asked[camera]:
+                took[camera] = now - self._begun[camera]
+            times.clear()
+        return took
+
+    def longest_wait(self) -> tuple[float, str]:
+        """For how long an image has been under way [s, wall], and of which camera."""
+        waits = [(self._begun[camera], camera) for camera in CAMERAS if self._asked[camera]]
+        begun, camera = min(waits, default=(math.inf, ""))
+        return wall.monotonic() - begun, camera
 
 
 class Guard:
@@ -196,10 +227,32 @@ def _problem(device: str, values: Values, measured: Values) -> str:
     return "" if -1e-3 <= opening <= GRIP[0] and 0 <= force <= GRIP[1] else "out of range"
 
 
+class RobotClock:
+    """The clock of the twin's stamps: simulated time, and what that has fallen behind the wall's.
+
+    A robot's clock does not stand still while its simulation waits for a processor, and the program places images by
+    it: with stamps of simulated time, those of a twin that runs 5 % slow would be a tenth of a second off.
+    """
+
+    def __init__(self) -> None:
+        self._since, self._behind = [-math.inf], [0.0]  # simulated time, and how far behind from then on [s]
+
+    def fell_behind(self, time: float, total: float) -> None:
+        """At `time` it is `total` behind."""
+        if total > self._behind[-1]:
+            self._since.append(time)
+            self._behind.append(total)
+
+    def at(self, time: float) -> float:
+        """What the clock showed at a simulated time [s]."""
+        return time + self._behind[bisect.bisect_right(self._since, time) - 1]
+
+
 class Twin:
     """A simulated station behind LCM.
 
-    station: its inputs are the robot's joints, its outputs its sensors. start: what its inputs hold at first.
+    station: its inputs are the robot's joints, its outputs its sensors. start: what its inputs hold at first. images,
+    rate: who makes the images of a paced twin, and how many.
     """
 
     def __init__(
@@ -211,6 +264,7 @@ class Twin:
         faults: Faults,
         *,
         images: LiveImages | None = None,
+        rate: CameraRate | None = None,
         lcm: DrakeLcm | None = None,
     ):
         self.station = station
@@ -222,6 +276,11 @@ class Twin:
         self._hardware = hardware
         self._camera = camera
         self._images = images
+        self._rate = rate
+        if images is not None and rate is not None:
+            images.period = rate.period
+        self._clock = RobotClock()
+        self._judged: tuple[float, float] | None = None  # when the cameras' rate was, and how far behind it was then
         self._bus = Bus(hardware, lcm)
         newest = hardware.lockstep and not self._bus.lcm.get_lcm_url().startswith("memq")
         self._out = Wire(faults, self._bus.send, newest)
@@ -307,7 +366,7 @@ class Twin:
             said = self.faults.frozen(row.key, time, values)
             if self.faults.acts("nan", row.device, time):
                 said = {port: np.full_like(value, np.nan) for port, value in said.items()}
-            self._say(row.key, row.encode(to_utime(self.faults.clock(row.device, time)), said))
+            self._say(row.key, row.encode(self._stamp(row.device, time), said))
         for frame in self._frames(time):
             self._put_image(frame, time)
         if self.tick % round(self._hardware.robot_period / TICK) == 0 and not self.faults.silent("robot", time):
@@ -316,17 +375,42 @@ class Twin:
                 **JOINTS,
                 "estop": self.faults.acts("estop", "robot", time),
             }
-            words = [*self._guard.faults(time), *self._bad.faults(time)]
+            words = [*self._guard.faults(time), *self._bad.faults(time), *self._slow_images()]
             state |= dict.fromkeys(words, 1.0)
             if self._bus.others(ROBOT):
                 state["two robots on the bus"] = 1.0
             message = signal(state)
-            message.timestamp = to_utime(self.faults.clock("robot", time))
+            message.timestamp = self._stamp("robot", time)
             self._say(STATE, message)
         self._out.pass_on(time)
         self._bus.announce(ROBOT)
         if self._started:
             self.simulator.AdvanceTo(time + 3 * SLOT)  # what does not depend on the answer
+
+    def _stamp(self, device: str, time: float) -> int:
+        """Of what a device reports now."""
+        return to_utime(self.faults.clock(device, self._clock.at(time)))
+
+    def _slow_images(self) -> list[str]:
+        """What the program should not have to guess from a silent camera."""
+        if self._images is None or self._rate is None:
+            return []
+        waited, camera = self._images.longest_wait()
+        limit = self._rate.limits.longest - MARGIN
+        return [f"the twin has needed more than {limit:.2g} s for an image of {camera}"] if waited > limit else []
+
+    def fell_behind(self, total: float) -> None:
+        """Paced: by how much simulated time is behind the wall's clock since the start [s], before every tick."""
+        self._clock.fell_behind(self.time, total)
+        if self._rate is None or self._images is None:
+            return
+        now = wall.monotonic()
+        begun, before = self._judged or (now, total)
+        if self._judged is None or now - begun >= SECOND:
+            took = self._images.took()
+            if self._judged is not None:
+                self._rate.judge((total - before) / (now - begun), took)
+            self._judged = (now, total)
 
     def _say(self, key: str, message: Any) -> None:
         if self._started:
@@ -362,7 +446,7 @@ class Twin:
             shown = self.faults.frozen(key, time, frame)
             if shown is not frame:
                 shown = CameraFrame(frame.camera, frame.time, frame.sequence, shown.image, shown.data)
-            self._say(key, image_message(shown))
+            self._say(key, image_message(dc.replace(shown, time=self._clock.at(shown.time))))
 
     def move(self) -> None:
         """Takes the commands that have arrived, which reach the joints in slot 3, and moves on to the next tick."""
