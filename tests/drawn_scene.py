@@ -1,12 +1,16 @@
 """Images drawn from geometry for the perception tests: area-sampled shapes through a lens, noise, JPEG."""
 
+import dataclasses as dc
+
 import cv2
 import numpy as np
 
 from valve_drake import frames
 from valve_drake.camera.lens import LensModel, StereoHead
 from valve_drake.messages import MarkerEdges, QuadEdges
-from valve_drake.perception.marker import Marker
+from valve_drake.perception.joint_fit import NODES
+from valve_drake.perception.marker import NEXT, Marker
+from valve_drake.perception.quadrilateral import meet, side_lines
 
 FINE = 8  # sub-samples per pixel and direction on a shape's outline
 
@@ -130,3 +134,39 @@ def edge_points(
 def pose_error(X: np.ndarray, X_true: np.ndarray) -> np.ndarray:
     """(theta in V, dp in L) of an estimate against the truth, as in RectangleEstimate.covariance."""
     return np.append(frames.rotation_vector(X_true[:, :3].T @ X[:, :3]), X[:, 3] - X_true[:, 3])
+
+
+def nees(error, covariance):
+    return float(error @ np.linalg.solve(covariance, error)) / 6
+
+
+def with_information(edges, turn=0):
+    """The same edges as corners and the information of two nodes on each side; the right image's sides counted anew."""
+    quads = []
+    for quad, k in ((edges.left, 0), (edges.right, turn)):
+        side = quad.side.astype(int)
+        corners = meet(side_lines(quad.points, side)[0])
+        along = corners[NEXT] - corners
+        share = ((quad.points - corners[side]) * along[side]).sum(1) / (along[side] ** 2).sum(1)
+        second = (share - NODES[0]) / (NODES[1] - NODES[0])
+        information = np.zeros((8, 8))
+        for n in range(4):
+            rows = np.column_stack([1 - second, second])[side == n] / quad.sigma
+            information[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] = rows.T @ rows
+        order = (np.arange(8) + 2 * k) % 8
+        quads.append(
+            dc.replace(
+                quad,
+                side=(side - k) % 4,
+                corners=np.roll(corners, -k, axis=0),
+                information=information[np.ix_(order, order)],
+            )
+        )
+    return dc.replace(edges, left=quads[0], right=quads[1])
+
+
+def off_the_epipolar_line(edges: MarkerEdges, px: float, head: StereoHead) -> MarkerEdges:
+    """The right image's points, moved down by `px`."""
+    down = np.array([0.0, px / head.right.focal()])
+    right = dc.replace(edges.right, points=edges.right.points + down, corners=edges.right.corners + down)
+    return dc.replace(edges, right=right)

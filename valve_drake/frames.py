@@ -50,10 +50,9 @@ def rotation(w: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b of two (3,) vectors; ten times as fast as np.cross, and called many times in every tick."""
-    ax, ay, az = a
-    bx, by, bz = b
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    """a x b of (3,) or (n, 3); ten times as fast as np.cross on a few vectors, and called many times in every tick."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]).T
 
 
 def skew(v: np.ndarray) -> np.ndarray:

@@ -49,8 +49,8 @@ from valve_drake.messages import (
     TurnState,
     Verdict,
 )
+from valve_drake.perception.fusion import fuse
 from valve_drake.perception.marker import Marker
-from valve_drake.perception.rectangle_estimator import fuse
 from valve_drake.task.modes import TABLE
 
 

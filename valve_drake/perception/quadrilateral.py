@@ -92,6 +92,25 @@ def side_lines(points: np.ndarray, side: np.ndarray, sides: int = 4) -> tuple[np
     return lines, math.sqrt(max(square, 0.0) / max(len(points) - 2 * sides, 1))
 
 
+def weighted_lines(points: np.ndarray, side: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    _, mean, scatter = side_moments(points, side, weight)
+    angle = np.arctan2(2 * scatter[:, 0, 1], scatter[:, 0, 0] - scatter[:, 1, 1]) / 2
+    normal = np.stack([-np.sin(angle), np.cos(angle)], -1)
+    return np.column_stack([normal, -(normal * mean).sum(1)])
+
+
+def side_moments(points: np.ndarray, side: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weight (4,), mean (4, 2) and weighted scatter (4, 2, 2) of the points of each side."""
+    total = np.bincount(side, weight, 4)
+    safe = np.maximum(total, 1e-300)[:, None]
+    mean = np.stack([np.bincount(side, weight * points[:, k], 4) for k in (0, 1)], -1) / safe
+    d = points - mean[side]
+    wx = weight * d[:, 0]
+    xx, xy = np.bincount(side, wx * d[:, 0], 4), np.bincount(side, wx * d[:, 1], 4)
+    yy = np.bincount(side, weight * d[:, 1] ** 2, 4)
+    return total, mean, np.stack([xx, xy, xy, yy], -1).reshape(4, 2, 2)
+
+
 def through_corners(corners: np.ndarray) -> np.ndarray:
     """The lines (4, 3) of the sides between corners (4, 2), positive inside; unit normals."""
     along = corners[NEXT] - corners
