@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time as wall
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ from valve_drake.stations.lcm_channels import (
     HardwareConfig,
 )
 from valve_drake.stations.reports import Senders
-from valve_drake.stations.twin import Guard, RobotClock
+from valve_drake.stations.twin import OVERDUE, Guard, RobotClock
 
 BASE = CHANNELS["base.command"]
 ARM = "left_arm.position_command"
@@ -375,6 +376,26 @@ def test_images_are_begun_as_seldom_as_the_rate_allows_and_of_both_eyes():
             begun += [(camera, sequence) for sequence in images._asked[camera]]
             images._asked[camera].clear()
     assert begun == [(eye, k) for k in (1, 3, 5, 7) for eye in ("head_left", "head_right")]
+
+
+def test_a_renderer_that_does_not_get_its_share_goes_before_other_programs_until_its_image_is_there(monkeypatch):
+    clock, hurried = [100.0], []
+    monkeypatch.setattr("valve_drake.stations.twin.wall.monotonic", lambda: clock[0])
+    monkeypatch.setattr("valve_drake.stations.twin.hurries", lambda *change: hurried.append(change))
+    images = SlowImages()
+    monkeypatch.setattr(images, "_worker", lambda name: SimpleNamespace(pid=7 if name.endswith("left") else 8))
+    images.wanted = {"head_left", "head_right"}
+    images.captured("head_left", Capture(0.125, 1, np.zeros(1)))
+    clock[0] += OVERDUE + 0.01
+    images.ready()
+    assert not hurried, "where the loops cannot go first, nobody goes before the program's loop"
+    images.yield_to(True)
+    for _ in range(3):
+        images.ready()
+        assert hurried == [(7, True)]
+    images._asked["head_left"].clear()
+    images.ready()
+    assert hurried == [(7, True), (7, False)]
 
 
 def test_an_image_that_takes_too_long_is_named_before_the_camera_looks_dead(monkeypatch):

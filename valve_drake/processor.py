@@ -30,6 +30,14 @@ def goes_first(priority: int) -> Iterator[bool]:
                 os.sched_setscheduler(thread, policy, parameter)
 
 
+def hurries(process: int, hurried: bool) -> None:
+    """Lets another process go before the machine's other programs, but after the paced loops, or no longer."""
+    with contextlib.suppress(OSError):  # not permitted, or it has ended
+        for thread in map(int, os.listdir(f"/proc/{process}/task")):
+            parameter = os.sched_param(1 if hurried else 0)
+            os.sched_setscheduler(thread, os.SCHED_FIFO if hurried else os.SCHED_OTHER, parameter)
+
+
 def _raised(priority: int) -> dict[int, tuple[int, os.sched_param]]:
     """Gives all threads the priority, the others one less -> what each had before; nothing if it is not permitted."""
     before: dict[int, tuple[int, os.sched_param]] = {}

@@ -110,7 +110,9 @@ def run_twin(
         pacer = None if lockstep else Pacer(idle=twin.pass_time)
         gc.collect()
         gc.freeze()
-        with goes_first(0 if lockstep else scenario.hardware.priority):
+        with goes_first(0 if lockstep else scenario.hardware.priority) as first:
+            if isinstance(workers, LiveImages):
+                workers.yield_to(first)
             while not (stop() or twin.gone or (duration is not None and twin.time >= duration)):
                 show(twin.time)
                 if pacer is None:

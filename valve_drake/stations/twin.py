@@ -14,6 +14,7 @@ lock-step with the program.
 """
 
 import bisect
+import contextlib
 import dataclasses as dc
 import math
 import os
@@ -29,7 +30,7 @@ from pydrake.systems.framework import Diagram
 from valve_drake.messages import CameraFrame
 from valve_drake.motion import slew
 from valve_drake.ports import SLOT, TICK
-from valve_drake.processor import YIELDING
+from valve_drake.processor import YIELDING, hurries
 from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rate import SECOND, CameraRate
 from valve_drake.stations.camera_rig import Capture
@@ -76,6 +77,7 @@ GONE = 3.0  # paced: a program that was silent for this long counts as gone; rai
 IDLE = 0.05  # lock-step: time between two reports before the start [s, wall clock]
 PATIENCE = {"cameras": 0.1, "controller": math.inf}  # of what does not come every tick (reports.py) [s]
 MARGIN = 0.1  # a late image is reported so long before the program would call its camera dead [s]
+OVERDUE = 0.2  # an image that is under way for longer needs help [s, wall]
 STARTING = 3.0  # the user is told if the first images take longer than this [s, wall clock]
 
 
@@ -90,6 +92,8 @@ class LiveImages(CameraWorkers):
         self._last = dict.fromkeys(CAMERAS, -math.inf)  # capture of the last image that was begun [s]
         self._begun: dict[str, float] = {}  # [s, wall]
         self._took: dict[str, list[float]] = {camera: [] for camera in CAMERAS}
+        self._loops_first = False
+        self._hurried: set[int] = set()  # processes
 
     def settle(self, stop: Callable[[], bool], notice: Callable[[str], None]) -> None:
         """Waits for the first images, which take a renderer seconds, or until `stop`. notice: tells the user."""
@@ -101,8 +105,6 @@ class LiveImages(CameraWorkers):
                 told = True
                 missing = ", ".join(camera for camera in CAMERAS if camera in self._unmade)
                 notice(f"the twin waits for its renderers: no image yet of {missing}")
-        for worker in self._workers:  # a late image is better than a late tick of either side
-            os.setpriority(os.PRIO_PROCESS, worker.pid, YIELDING)
 
     def captured(self, name: str, capture: Capture) -> None:
         # A camera that cannot keep up drops images; the two of a pair drop the same ones.
@@ -125,7 +127,27 @@ class LiveImages(CameraWorkers):
             if frame.sequence == 0:
                 self._unmade.discard(frame.camera)
         self._made.clear()
+        if self._loops_first:
+            self._hurry(now)
         return [frame for frame in frames if frame.sequence > 0]
+
+    def yield_to(self, loops_first: bool) -> None:
+        """Gives the renderers their share of the processor: a late image is better than a late tick of either side.
+
+        loops_first: both sides' loops go before all others anyway; then the renderers are as good as other programs,
+        and one that does not get its share for OVERDUE goes before those.
+        """
+        self._loops_first = loops_first
+        for worker in self._workers:
+            with contextlib.suppress(PermissionError):  # to be no longer as nice as it was
+                os.setpriority(os.PRIO_PROCESS, worker.pid, 0 if loops_first else YIELDING)
+
+    def _hurry(self, now: float) -> None:
+        late = {camera for camera in CAMERAS if self._asked[camera] and now - self._begun[camera] > OVERDUE}
+        hurried = {self._worker(camera).pid for camera in late}
+        for process in hurried ^ self._hurried:
+            hurries(process, process in hurried)
+        self._hurried = hurried
 
     def took(self) -> dict[str, float]:
         """By camera, the mean time that an image took since the last call, or so far if none came [s, wall]."""
