@@ -62,6 +62,15 @@ def test_a_renderer_that_cannot_follow_is_told_and_asked_for_less(rate, told):
     assert told[0].startswith("the twin needs 90 ms for an image of right_wrist: ")
 
 
+def test_a_twin_with_which_no_program_can_work_says_so_to_the_program(rate):
+    rate.judge(0.4, FAST)
+    assert rate.trouble == ""
+    rate.judge(0.62, FAST)
+    assert rate.trouble == "the twin is 62 % slower than real time"
+    rate.judge(0.1, FAST)
+    assert rate.trouble == ""
+
+
 def test_with_room_the_cameras_are_as_fast_as_before_and_a_vain_attempt_makes_it_patient(rate, told):
     def calm_until_faster():
         factor, seconds = rate.factor, 0
@@ -90,13 +99,14 @@ def test_without_room_for_twice_the_images_they_stay_slow(rate):
 @pytest.mark.parametrize("age", [0.3, 0.5, 1.0])
 @pytest.mark.parametrize("floor", [0.1, 0.25, 0.5])
 def test_whatever_is_configured_a_slow_camera_does_not_look_dead(age, floor):
-    """Images of the floor's period, each of which takes a random time up to the longest that is no fault."""
+    """Images of the floor's period, each of which takes a random time up to what the floor leaves of the age."""
     ages = AGES | {"head_left": age}
     camera = CameraConfig(slowest_period=floor, head_period=0.125)
     rate = CameraRate(limits(camera, ages), lambda line: None)
     for _ in range(9):
         rate.judge(0.5, FAST)
-    period, longest = rate.period("head_left"), rate.limits.longest
+    period = rate.period("head_left")
+    longest = age - rate.limits.slowest
     assert period <= max(floor, camera.head_period)
     captured, arrived, gaps = 0.0, 0.0, []
     for k in range(200):

@@ -17,6 +17,7 @@ SECOND = 1.0  # between two judgements [s, wall]
 BEHIND = 0.03  # share of a second that may be lost; raise it for a machine whose clock stutters
 ROOM = 4  # seconds without loss before the cameras are faster again; doubled whenever that was too early
 MOST_ROOM = 64
+HOPELESS = 0.5  # share of a second that was lost: no program can work with that, and it is told why
 
 
 def camera_periods(camera: CameraConfig) -> dict[str, float]:
@@ -30,12 +31,12 @@ class Limits:
 
     fastest: dict[str, float]
     slowest: float  # the floor
-    longest: float  # an image that has been under way for longer is a fault: with the floor before it that is an age
+    age: float  # of a camera, after which the program calls it dead
 
 
 def limits(camera: CameraConfig, max_age: Mapping[str, float]) -> Limits:
     """Of a scenario. max_age: of a device, after which the program calls it dead [s]. Two images are never farther
-    apart than the floor and the time that the second one takes, so that these two share the least age of the cameras.
+    apart than the floor and the time that the second one takes, so the floor is at most half of the least such age.
 
     Raises ConfigError for a camera that is slower than that by its own period.
     """
@@ -45,7 +46,7 @@ def limits(camera: CameraConfig, max_age: Mapping[str, float]) -> Limits:
         rule = f"for a twin at most half of supervisor.max_age of the cameras, {least / 2:g} s"
         require(period <= least / 2, f"simulation.camera.{key}", rule, period)
     slowest = max(min(camera.slowest_period, least / 2), *fastest.values())
-    return Limits(fastest, slowest, least - slowest)
+    return Limits(fastest, slowest, least)
 
 
 class CameraRate:
@@ -54,6 +55,7 @@ class CameraRate:
     def __init__(self, limits: Limits, notice: Callable[[str], None]):
         self.limits = limits
         self.factor = self.largest = 1  # now, and so far
+        self.trouble = ""  # why no program can work with this twin now
         self._notice = notice
         self._most = {  # a camera captures at multiples of its own period only
             camera: 2 ** math.floor(math.log2(limits.slowest / period)) for camera, period in limits.fastest.items()
@@ -68,6 +70,7 @@ class CameraRate:
     def judge(self, lost: float, took: Mapping[str, float]) -> None:
         """After a second. lost: share of it by which the twin fell behind the clock. took: by camera, the mean time
         that one of its images needed, from the capture [s]."""
+        self.trouble = f"the twin is {100 * lost:.0f} % slower than real time" if lost > HOPELESS else ""
         late = {camera: time for camera, time in took.items() if time > self.period(camera)}
         if lost > BEHIND or late:
             if self._calm < 2 and self.factor < self.largest:  # it has just been made faster

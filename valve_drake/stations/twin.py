@@ -19,7 +19,7 @@ import dataclasses as dc
 import math
 import os
 import time as wall
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,7 @@ BACK = 0.3  # speed of a joint that was stopped, back to its commands [rad/s]
 GONE = 3.0  # paced: a program that was silent for this long counts as gone; raise it for a slow one [s]
 IDLE = 0.05  # lock-step: time between two reports before the start [s, wall clock]
 PATIENCE = {"cameras": 0.1, "controller": math.inf}  # of what does not come every tick (reports.py) [s]
-MARGIN = 0.1  # a late image is reported so long before the program would call its camera dead [s]
+MARGIN = 0.2  # a camera without images is named so long before the program would call it dead [s]
 OVERDUE = 0.2  # an image that is under way for longer needs help [s, wall]
 STARTING = 3.0  # the user is told if the first images take longer than this [s, wall clock]
 
@@ -86,11 +86,11 @@ class LiveImages(CameraWorkers):
 
     def __init__(self, *rig: Any) -> None:
         super().__init__(*rig)
-        self.wanted: set[str] = set()
+        self.wanted: frozenset[str] = frozenset()
+        self._shown_at: dict[str, float] = {}  # last image, or since when it is wanted [s, wall]
         self.period: Callable[[str], float] = lambda camera: 0.0  # between two images [s]; less: as the camera captures
         self._unmade = set(CAMERAS)  # cameras whose first image, which is made unasked, is not there yet
-        self._last = dict.fromkeys(CAMERAS, -math.inf)  # capture of the last image that was begun [s]
-        self._begun: dict[str, float] = {}  # [s, wall]
+        self._begun = dict.fromkeys(CAMERAS, -math.inf)  # when the last image was captured [s, wall]
         self._took: dict[str, list[float]] = {camera: [] for camera in CAMERAS}
         self._loops_first = False
         self._hurried: set[int] = set()  # processes
@@ -106,14 +106,19 @@ class LiveImages(CameraWorkers):
                 missing = ", ".join(camera for camera in CAMERAS if camera in self._unmade)
                 notice(f"the twin waits for its renderers: no image yet of {missing}")
 
+    def want(self, cameras: Collection[str]) -> None:
+        """What is asked for from now on."""
+        self._shown_at |= dict.fromkeys(set(cameras) - self.wanted, wall.monotonic())
+        self.wanted = frozenset(cameras)
+
     def captured(self, name: str, capture: Capture) -> None:
         # A camera that cannot keep up drops images; the two of a pair drop the same ones.
         mate = MATE[name]
         free = not self._asked[name] | self._asked[mate]
-        due = capture.time - max(self._last[name], self._last[mate]) > self.period(name) - TICK
+        now = wall.monotonic()
+        due = now - max(self._begun[name], self._begun[mate]) > self.period(name) - 2 * TICK
         if capture.sequence == 0 or (name in self.wanted and (capture.sequence in self._asked[mate] or (free and due))):
-            self._last[name] = capture.time
-            self._begun[name] = wall.monotonic()
+            self._begun[name] = now
             self._ask(name, capture)
 
     def ready(self) -> list[CameraFrame]:
@@ -124,6 +129,7 @@ class LiveImages(CameraWorkers):
         for frame in frames:
             del self._asked[frame.camera][frame.sequence]
             self._took[frame.camera].append(now - self._begun[frame.camera])
+            self._shown_at[frame.camera] = now
             if frame.sequence == 0:
                 self._unmade.discard(frame.camera)
         self._made.clear()
@@ -160,11 +166,10 @@ class LiveImages(CameraWorkers):
             times.clear()
         return took
 
-    def longest_wait(self) -> tuple[float, str]:
-        """For how long an image has been under way [s, wall], and of which camera."""
-        waits = [(self._begun[camera], camera) for camera in CAMERAS if self._asked[camera]]
-        begun, camera = min(waits, default=(math.inf, ""))
-        return wall.monotonic() - begun, camera
+    def longest_silence(self) -> tuple[float, str]:
+        """For how long a camera that is wanted has shown nothing [s, wall], and which."""
+        since, camera = min(((self._shown_at[camera], camera) for camera in self.wanted), default=(math.inf, ""))
+        return wall.monotonic() - since, camera
 
 
 class Guard:
@@ -397,7 +402,7 @@ class Twin:
                 **JOINTS,
                 "estop": self.faults.acts("estop", "robot", time),
             }
-            words = [*self._guard.faults(time), *self._bad.faults(time), *self._slow_images()]
+            words = [*self._guard.faults(time), *self._bad.faults(time), *self._too_slow()]
             state |= dict.fromkeys(words, 1.0)
             if self._bus.others(ROBOT):
                 state["two robots on the bus"] = 1.0
@@ -413,13 +418,14 @@ class Twin:
         """Of what a device reports now."""
         return to_utime(self.faults.clock(device, self._clock.at(time)))
 
-    def _slow_images(self) -> list[str]:
-        """What the program should not have to guess from a silent camera."""
+    def _too_slow(self) -> list[str]:
+        """What the program should not have to guess from silence."""
         if self._images is None or self._rate is None:
             return []
-        waited, camera = self._images.longest_wait()
-        limit = self._rate.limits.longest - MARGIN
-        return [f"the twin has needed more than {limit:.2g} s for an image of {camera}"] if waited > limit else []
+        words = [self._rate.trouble] if self._rate.trouble else []
+        silence, camera = self._images.longest_silence()
+        limit = self._rate.limits.age - MARGIN
+        return words + ([f"the twin has not made an image of {camera} for {limit:g} s"] if silence > limit else [])
 
     def fell_behind(self, total: float) -> None:
         """Paced: by how much simulated time is behind the wall's clock since the start [s], before every tick."""
@@ -450,7 +456,7 @@ class Twin:
         if time - asked > REQUEST_AGE:
             wanted = set()
         if self._images is not None:
-            self._images.wanted = wanted
+            self._images.want(wanted)
             return self._images.ready()
         frames = []
         for camera in sorted(wanted):
