@@ -6,7 +6,7 @@ and the *nominal* head: an error of the head's mount counts as an error of the e
 
 import dataclasses as dc
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,8 +15,9 @@ from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, inverse, make, planar, rot_z, rotation_vector, wrap
 from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import SIDES, Mode
-from valve_drake.recording.reader import LogReader
+from valve_drake.recording.reader import LogReader, Record
 from valve_drake.recording.signals import TORSO
+from valve_drake.recording.tables import Table
 
 ARMS = {side: tuple(f"{side}_arm_{k}" for k in range(1, 7)) for side in SIDES}
 SCHEMAS = {  # of the topics that are read here
@@ -179,34 +180,33 @@ class Traces:
 
     @_Trace
     def joints(self) -> Joints | None:
-        states, commands = self._messages("/joint_states"), self._messages("/joint_commands")
-        if not states:
+        states, commands = self._table("/joint_states"), self._table("/joint_commands")
+        if states is None:
             return None
-        names = tuple(joint.name for joint in states[0][1].joints)
-        table = np.array([[(j.position, j.velocity) for j in m.joints] for _, m in states])
-        time = np.array([t for t, _ in states])
-        commanded = np.full(table.shape[:2], np.nan)
-        if commands:
-            known = [joint.name for joint in commands[0][1].joints]
-            asked = np.array([[j.position for j in m.joints] for _, m in commands])
-            when = np.array([t for t, _ in commands])
+        time, measured = states
+        names = tuple(dict.fromkeys(path.split(".")[1] for path in measured.columns if path.startswith("joints.")))
+        position, velocity = (_columns(measured, names, part) for part in ("position", "velocity"))
+        commanded = np.full(position.shape, np.nan)
+        if commands is not None:
+            when, asked = commands
             before = np.clip(np.searchsorted(when, time, side="right") - 1, 0, None)
             for k, name in enumerate(names):
-                if name in known and not name.startswith("base"):  # the base is commanded by speed
-                    commanded[:, k] = asked[before, known.index(name)]
-        return Joints(time, names, table[:, :, 0], table[:, :, 1], commanded)
+                column = asked.columns.get(f"joints.{name}.position")
+                if column is not None and not name.startswith("base"):  # the base is commanded by speed
+                    commanded[:, k] = asked.values[before, column]
+        return Joints(time, names, position, velocity, commanded)
 
     @_Trace
     def truth(self) -> Truth | None:
         topics = ("/truth/base_pose", "/truth/marker_pose", "/truth/valve_angle")
-        rows = [{t: m.values for t, m in self._messages(topic)} for topic in topics]
-        when = sorted(set(rows[0]) & set(rows[1]) & set(rows[2]))
+        tables = [table for topic in topics if (table := self._table(topic)) is not None]
+        rows = [dict(zip(time.tolist(), _vector(numbers))) for time, numbers in tables]
+        when = sorted(set.intersection(*map(set, rows))) if len(rows) == len(topics) else []
         if not when:
             return None
-        time = np.array(when)
         base, marker, angle = (np.array([found[t] for t in when]) for found in rows)
         base = np.column_stack([base[:, :2], np.unwrap(base[:, 2])])
-        return Truth(time, base, marker.reshape(-1, 3, 4), angle[:, 0] - angle[0, 0])
+        return Truth(np.array(when), base, marker.reshape(-1, 3, 4), angle[:, 0] - angle[0, 0])
 
     @_Trace
     def estimates(self) -> Estimates | None:
@@ -312,8 +312,8 @@ class Traces:
 
     @functools.cached_property
     def reports(self) -> list[tuple[float, Any]]:
-        """The station's health messages with their times."""
-        return self._messages("/health")
+        """The station's health messages, as protobuf's, with their times."""
+        return self._messages("/health", self.reader.parse)
 
     @_Trace
     def health(self) -> tuple[np.ndarray, tuple[str, ...], np.ndarray] | None:
@@ -323,7 +323,7 @@ class Traces:
             return None
         devices = rows[-1][1].devices
         rows = [(t, m) for t, m in rows if m.devices == devices]
-        return np.array([t for t, _ in rows]), devices, np.array([m.ages for _, m in rows])
+        return np.array([t for t, _ in rows]), tuple(devices), np.array([list(m.ages) for _, m in rows])
 
     @functools.cached_property
     def faults(self) -> list[tuple[float, str]]:
@@ -339,7 +339,7 @@ class Traces:
     @_Trace
     def selector(self) -> dict[str, dict[str, int]] | None:
         """command_selector's ticks by what it did: "limited", "refused", "tripped" -> name -> ticks."""
-        rows = self._messages("/command_selector/report")
+        rows = self._messages("/command_selector/report", self.reader.parse)
         if not rows:
             return None
         out: dict[str, dict[str, int]] = {"limited": {}, "refused": {}, "tripped": {}}
@@ -360,8 +360,26 @@ class Traces:
                 angle = status.value
         return angle
 
-    def _messages(self, topic: str) -> list[tuple[float, Any]]:
+    def _messages(self, topic: str, decode: Callable[[Record], Any] | None = None) -> list[tuple[float, Any]]:
         """(time, message) of a topic; none if it is not there or from another program."""
+        decode = decode or self.reader.decode
+        try:
+            return [(record.time, decode(record)) for record in self._take(topic)]
+        except ConfigError as error:
+            self.missing[topic] = str(error)
+            return []
+
+    def _table(self, topic: str) -> tuple[np.ndarray, Table] | None:
+        """The times (n,) [s] and the numbers of a topic's messages; None if there are none."""
+        records = self._take(topic)
+        try:
+            return (np.array([r.time for r in records]), self.reader.table(records)) if records else None
+        except ConfigError as error:
+            self.missing[topic] = str(error)
+            return None
+
+    def _take(self, topic: str) -> list[Record]:
+        """A topic's records, which are then forgotten; none if it is not there or from another program."""
         found = self.reader.topics.get(topic)
         if found is None or found.count == 0:
             self.missing[topic] = "not in this log"
@@ -370,11 +388,35 @@ class Traces:
         elif found.count > MOST:
             self.missing[topic] = f"holds {found.count} messages, more than the {MOST} that can be shown"
         else:
-            try:
-                return [(r.time, self.reader.decode(r)) for r in self.reader.records([topic]) if len(r.data) <= LARGEST]
-            except ConfigError as error:
-                self.missing[topic] = str(error)
+            return self._records.pop(topic, None) or list(self._read([topic]))
         return []
+
+    @functools.cached_property
+    def _records(self) -> dict[str, list[Record]]:
+        """The records of all topics that are read here, in one pass over the log if there are not too many."""
+        topics = [topic for topic, found in self.reader.topics.items() if topic in SCHEMAS and found.count <= MOST]
+        records: dict[str, list[Record]] = {}
+        if sum(self.reader.topics[topic].count for topic in topics) <= MOST:
+            for record in self._read(topics):
+                records.setdefault(record.topic, []).append(record)
+        return records
+
+    def _read(self, topics: list[str]) -> Iterator[Record]:
+        return (record for record in self.reader.records(topics) if len(record.data) <= LARGEST)
+
+
+def _columns(table: Table, names: tuple[str, ...], quantity: str) -> np.ndarray:
+    """One quantity of joints (n, J); 0 where a joint has none."""
+    values = np.zeros((len(table.values), len(names)))
+    for k, name in enumerate(names):
+        if (column := table.columns.get(f"joints.{name}.{quantity}")) is not None:
+            values[:, k] = table.values[:, column]
+    return values
+
+
+def _vector(table: Table) -> np.ndarray:
+    """The values (n, m) of Vector messages."""
+    return table.values[:, [k for path, k in table.columns.items() if path.startswith("values.")]]
 
 
 def interpolate(time: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -105,6 +105,7 @@ class Contents:
         self._data, self._size = data, len(data)
         self._next = np.zeros(1 << 16, np.int64)  # by channel: highest number of a message, plus 1
         self._index_bytes = self._definition_bytes = 0
+        self._defined: set[bytes] = set()  # definitions in chunks, each as its whole record
         self._unpacked: tuple[int, Buffer] | None = None  # the chunk that was read last: where, content
         self._gaps: list[_Gap] = []
         self._damaged_chunks: list[ChunkAt] = []
@@ -251,9 +252,13 @@ class Contents:
             raise
         found = scan(content, start, end)
         for definition in found.definitions:
+            record = content[definition.start - HEAD.size : definition.end]
+            if record in self._defined:  # every chunk repeats them
+                continue
             parsed = parse(content, definition)
             assert isinstance(parsed, Schema | Channel)
             self._define(definition, parsed)
+            self._defined.add(record)
         self._add_block(chunk, content, found, start)
         if found.end != end:
             raise Unsound(f"a chunk holds {end - found.end} bytes that are no records")

@@ -9,7 +9,7 @@ import mmap
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from google.protobuf.message import Message as Proto
@@ -24,9 +24,11 @@ from valve_drake.recording.container import RECOVERED, active
 from valve_drake.recording.contents import Contents
 from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.records import HEAD, ROW, Frame, attachment, attachment_to
+from valve_drake.recording.tables import Table, table
 
 LONGEST = 200  # a reason in an error line is cut to this [characters]
 
+_Decoder: TypeAlias = tuple[type[Message] | None, Callable[[bytes], Proto]]  # the program's class, if it is one; parser
 _OTHERS = {b"#ROSBAG": "a ROS 1 bag", b"SQLite format 3": "a ROS 2 bag", b"RRF": "a Rerun recording"}
 _DATA = ROW.itemsize  # of a message, from the beginning of its record [bytes]
 
@@ -81,7 +83,7 @@ class LogReader:
         self.metadata = {record.name: record.metadata for record in self.all_metadata}
         self.attachments: Mapping[str, Attachment] = _Attachments(self._data, self._contents.attachments)
         self._by_topic: dict[str, list[int]] = {}  # ids of its channels
-        self._decoders: dict[int, Callable[[bytes], Message | Proto]] = {}
+        self._decoders: dict[int, _Decoder] = {}
         self.topics = self._collect_topics()
         filled = [topic for topic in self.topics.values() if topic.count > 0]
         self.start = min((topic.start for topic in filled), default=0.0)
@@ -115,10 +117,29 @@ class LogReader:
     def decode(self, record: Record) -> Message | Proto:
         """The message in a record of this log; ConfigError if this version of the program cannot hold it."""
         try:
-            return self._decoder(record)(record.data)
+            kind, parse = self._decoder(record)
+            proto = parse(record.data)
+            return proto if kind is None else schemas.from_proto(kind, proto)
         except Exception as error:  # a schema of another program can fail in any way while it is built or used
-            words = f"was not recorded by this version of the program: {str(error)[:LONGEST]}"
-            raise ConfigError(f"{self.path}: {record.topic} {words}") from error
+            raise self._foreign(record, error) from error
+
+    def parse(self, record: Record) -> Proto:
+        """As `decode`, but always protobuf's message: made in a tenth of the time."""
+        try:
+            return self._decoder(record)[1](record.data)
+        except Exception as error:
+            raise self._foreign(record, error) from error
+
+    def table(self, records: Sequence[Record]) -> Table:
+        """The numbers in records of one topic, of which there is at least one; ConfigError as for `decode`."""
+        try:
+            return table([record.data for record in records], self._decoder(records[0])[1])
+        except Exception as error:
+            raise self._foreign(records[0], error) from error
+
+    def _foreign(self, record: Record, error: Exception) -> ConfigError:
+        words = f"was not recorded by this version of the program: {str(error)[:LONGEST]}"
+        return ConfigError(f"{self.path}: {record.topic} {words}")
 
     def series(self, topic: str, fields: Iterable[str]) -> dict[str, np.ndarray]:
         """One topic as arrays: "time" (N,) [s] and every field (N, ...); a dotted name reaches into nested messages.
@@ -198,7 +219,7 @@ class LogReader:
                 topic, k = names[channel]
                 yield Record(topic, when, sequence, data, published, k)
 
-    def _decoder(self, record: Record) -> Callable[[bytes], Message | Proto]:
+    def _decoder(self, record: Record) -> _Decoder:
         id = self._by_topic[record.topic][record.channel]
         if id not in self._decoders:
             channel = self._contents.channels[id]
@@ -206,8 +227,7 @@ class LogReader:
             parse = DecoderFactory().decoder_for(channel.message_encoding, schema)
             if parse is None or schema is None:
                 raise ValueError(f"its messages are {channel.message_encoding!r}, not protobuf")
-            kind = schemas.kind_named(schema.name)
-            self._decoders[id] = parse if kind is None else lambda data: schemas.from_proto(kind, parse(data))
+            self._decoders[id] = schemas.kind_named(schema.name), parse
         return self._decoders[id]
 
 

@@ -18,11 +18,9 @@ import bisect
 import collections
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, Diagram, LeafSystem
 
@@ -30,24 +28,28 @@ from valve_drake.checks import ConfigError
 from valve_drake.messages import SIDES, CameraFrame
 from valve_drake.ports import TICK
 from valve_drake.recording.foxglove import NANO, nanoseconds
-from valve_drake.recording.reader import LogReader
+from valve_drake.recording.reader import LogReader, Record
 from valve_drake.recording.signals import FRAMES, MEASURED, topic_of
 from valve_drake.stations.camera_rig import decode_image
 from valve_drake.stations.contract import CAMERAS, CONTRACT, PortSpec, station_of
 
 JOINTS, HEALTH, OPERATOR = "/joint_states", "/health", "/operator/command"
-WRENCHES = {f"/{side}_wrist/wrench": f"{side}_wrist.wrench" for side in SIDES}
 CONSUMERS = {topic_of(port) for port, _, _ in FRAMES.values()}
-_MEASURED = {port: [name.split(".") for name in names] for port, names in MEASURED.items()}  # joint, quantity
+_JOINT = "joints."
+_WRENCH = [f"{part}.{k}" for part in ("torque", "force") for k in range(3)]
+VECTORS: dict[str, dict[str, list[str]]] = {  # topic -> port -> where its values are in the topic's messages
+    JOINTS: {port: [_JOINT + name for name in names] for port, names in MEASURED.items()},
+    **{f"/{side}_wrist/wrench": {f"{side}_wrist.wrench": _WRENCH} for side in SIDES},
+}
 IMAGES = {f"/{camera}/image": camera for camera in CAMERAS}
 
 
 class Track:
     """What one port showed: values by the time of the tick that recorded them."""
 
-    def __init__(self) -> None:
-        self.times: list[float] = []  # [s]
-        self.values: list[Any] = []
+    def __init__(self, times: Iterable[float] = (), values: Iterable[Any] = ()) -> None:
+        self.times = list(times)  # [s]
+        self.values = list(values)
 
     def add(self, time: float, value: Any) -> None:
         self.times.append(time)
@@ -71,24 +73,23 @@ class Recording:
         self._log = log
         self.tracks: dict[str, Track] = collections.defaultdict(Track)
         self.requests = Track()
-        needed = {JOINTS, HEALTH, OPERATOR, *WRENCHES, *CONSUMERS}
+        needed = {HEALTH, OPERATOR, *VECTORS, *CONSUMERS}
         if missing := sorted(needed - {name for name, topic in log.topics.items() if topic.count > 0}):
             raise ConfigError(f"{log.path} cannot be replayed: it has no messages of {', '.join(missing)}")
         images = set()  # topic, time
+        vectors: dict[str, list[Record]] = {topic: [] for topic in VECTORS}
         for record in log.records(needed | (IMAGES.keys() & log.topics)):
             topic, time = record.topic, record.time
             if topic in IMAGES:
                 images.add((topic, time))
-                continue
-            message: Any = log.decode(record)
-            if topic == JOINTS:
-                self._add_joints(time, message)
-            elif topic in WRENCHES:
-                self.tracks[WRENCHES[topic]].add(time, np.concatenate([message.torque, message.force]))
+            elif topic in vectors:
+                vectors[topic].append(record)
             elif topic in CONSUMERS:
-                self._add_frames(topic, time, message)
+                self._add_frames(topic, time, log.decode(record))
             else:
-                (self.requests if topic == OPERATOR else self.tracks["health"]).add(time, message)
+                (self.requests if topic == OPERATOR else self.tracks["health"]).add(time, log.decode(record))
+        for topic, ports in VECTORS.items():
+            self._add_vectors(vectors[topic], ports)
         self.end = self._sound_end()
         for camera in CAMERAS:
             track = self.tracks[f"{camera}.image"]
@@ -108,16 +109,16 @@ class Recording:
                 return CameraFrame(header.camera, header.time, header.sequence, decode_image(data), data)
         raise ConfigError(f"{self._log.path} holds another image of {header.camera} at t = {time:.3f} s")
 
-    def _add_joints(self, time: float, states: JointStates) -> None:
-        joints = {joint.name: joint for joint in states.joints}
-        for port, parts in _MEASURED.items():
-            values = []
-            for name, quantity in parts:
-                joint = joints.get(name)
-                if joint is None or not joint.HasField(quantity):
-                    raise ConfigError(f"{self._log.path}: {JOINTS} has no {name}.{quantity}")
-                values.append(getattr(joint, quantity))
-            self.tracks[port].add(time, np.array(values))
+    def _add_vectors(self, records: list[Record], ports: Mapping[str, Sequence[str]]) -> None:
+        """The ports of one topic; `ports`: of each the paths of its values."""
+        topic, table = records[0].topic, self._log.table(records)
+        times = [record.time for record in records]
+        for port, paths in ports.items():
+            for path in paths:
+                if path not in table.columns or path in table.gaps:
+                    raise ConfigError(f"{self._log.path}: {topic} has no {path.removeprefix(_JOINT)}")
+            values = table.values[:, [table.columns[path] for path in paths]]
+            self.tracks[port] = Track(times, values)
 
     def _add_frames(self, topic: str, time: float, message: Any) -> None:
         for camera, (port, _, frame) in FRAMES.items():
