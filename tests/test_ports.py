@@ -9,7 +9,7 @@ import pytest
 from helpers import Rig, SourceBlock, assert_clones_are_independent, assert_holds_between_updates, ports
 from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem, ValueProducer
 
 from valve_drake.memory import lock
 from valve_drake.messages import Health, Mode, ModeState, Status, StereoPosition
@@ -349,3 +349,22 @@ def test_a_sleeping_block_is_the_same_in_a_clone():
     clone = Simulator(block, simulator.get_context().Clone())
     clone.AdvanceTo(8 * TICK)
     assert block.memory(clone.get_context()) == block.memory(simulator.get_context()) == 1
+
+
+def test_where_every_block_due_sleeps_drake_forgets_no_value():
+    """Else each output of each sleeper is computed again in every tick."""
+    block = Sleeper()
+    seen = block.DeclareCacheEntry(
+        "seen", ValueProducer(lambda: Value(0), lambda context, value: None), {block.xa_ticket()}
+    )
+    simulator = Simulator(block)
+    context = simulator.get_mutable_context()
+    block.GetInputPort("mode").FixValue(context, Value(ModeState(mode="turn", activation=1)))
+    forgotten = []
+    for tick in range(6):
+        if tick == 3:
+            block.GetInputPort("mode").FixValue(context, Value(ModeState(mode="search", activation=2)))
+        seen.EvalAbstract(context)
+        simulator.AdvanceTo((tick + 1) * TICK)
+        forgotten.append(seen.is_out_of_date(context))
+    assert forgotten == [True, True, True, True, False, False]

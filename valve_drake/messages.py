@@ -20,21 +20,20 @@ DEVICES = ("base", "torso", *(f"{s}_{d}" for s in SIDES for d in ("arm", "grippe
 
 def array(*shape: int, fill: float = 0.0, optional: bool = False) -> Any:
     """A float64 array field of this shape; -1 is any length. `optional` fields are None by default."""
-    metadata = {"shape": shape, "optional": optional}
     if optional:
-        return dc.field(default=None, metadata=metadata)
-    return _shared(np.full(tuple(0 if n < 0 else n for n in shape), fill), metadata)
+        return dc.field(default=None, metadata={"shape": shape, "optional": True, "default": None})
+    return _shared(np.full(tuple(0 if n < 0 else n for n in shape), fill), shape)
 
 
 def transform() -> Any:
     """A field for a rigid transform X as its 3x4 matrix [R | p]; identity by default."""
-    return _shared(np.eye(3, 4), {"shape": (3, 4), "optional": False})
+    return _shared(np.eye(3, 4), (3, 4))
 
 
-def _shared(default: np.ndarray, metadata: dict[str, Any]) -> Any:
+def _shared(default: np.ndarray, shape: tuple[int, ...]) -> Any:
     """A field whose default all messages share: it is read-only."""
     default.setflags(write=False)
-    return dc.field(default_factory=lambda: default, metadata=metadata)
+    return dc.field(default_factory=lambda: default, metadata={"shape": shape, "optional": False, "default": default})
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -43,12 +42,17 @@ class Message:
 
     def __post_init__(self) -> None:
         values = self.__dict__
-        for name, shape, optional in _array_fields(type(self)):
+        for name, shape, default in _array_fields(type(self)):
             value = values[name]
-            if value is None and optional:
+            if value is default:
                 continue
-            frozen = type(value) is np.ndarray and value.base is None and not value.flags.writeable
-            if not (frozen and value.dtype == _DOUBLE):  # immutable arrays are shared, not copied
+            # Arrays that nobody can change are shared. The commonest tests first: messages are made in every tick.
+            if not (
+                type(value) is np.ndarray
+                and value.dtype is _DOUBLE
+                and value.base is None
+                and not value.flags.writeable
+            ):
                 value = np.array(value, dtype=_DOUBLE)
                 value.setflags(write=False)
                 values[name] = value
@@ -69,14 +73,17 @@ class Message:
 
 
 _DOUBLE = np.dtype(np.float64)
-_ARRAY_FIELDS: dict[type, list[tuple[str, tuple[int, ...], bool]]] = {}
 
 
-def _array_fields(kind: type) -> list[tuple[str, tuple[int, ...], bool]]:
+_ARRAY_FIELDS: dict[type, list[tuple[str, tuple[int, ...], np.ndarray | None]]] = {}
+
+
+def _array_fields(kind: type) -> list[tuple[str, tuple[int, ...], np.ndarray | None]]:
+    """Name, shape and default of each array field; the default, None or an array that all share, needs no check."""
     fields = _ARRAY_FIELDS.get(kind)
     if fields is None:
         fields = _ARRAY_FIELDS[kind] = [
-            (f.name, f.metadata["shape"], f.metadata["optional"]) for f in dc.fields(kind) if "shape" in f.metadata
+            (f.name, f.metadata["shape"], f.metadata["default"]) for f in dc.fields(kind) if "shape" in f.metadata
         ]
     return fields
 

@@ -55,7 +55,8 @@ class Player:
         for played in blocks:
             name = played.block.get_name()
             for port, declared in played.block.sources.items():
-                played.sources[port] = Source(_Wired(), self._read(wires[f"{name}.{port}"]), declared.kind)
+                read = self._read(wires[f"{name}.{port}"])
+                played.sources[port] = declared._replace(port=_Wired(), evaluate=read)
         recorder.listen(self._recorded)
         self._blocks = blocks
         cycle = math.lcm(*(period for played in blocks for period, _, _ in played.works))

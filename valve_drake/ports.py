@@ -37,7 +37,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar, Union
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
 from valve_drake import profiling
 from valve_drake.memory import lock
@@ -61,7 +61,7 @@ class _Port:
         self.name, self.kind, self.default = name, kind, default
 
     def __get__(self, inputs: "Inputs | None", owner: type) -> Any:
-        return self if inputs is None else inputs.read(self.name, self.default)
+        return self if inputs is None else inputs[self.name]
 
     def __set__(self, inputs: "Inputs", value: Any) -> None:
         raise AttributeError(f"input port {self.name} can only be read")
@@ -90,15 +90,11 @@ class Inputs:
         self._context = context
 
     def __getitem__(self, name: str) -> Any:
-        port = getattr(type(self), name, None)
-        return self.read(name, port.default if isinstance(port, _Port) else _REQUIRED)
-
-    def read(self, name: str, default: Any) -> Any:
-        """The value of a port, or `default` while nothing is connected to it.
+        """The value of a port, or its default while nothing is connected to it.
 
         Raises RuntimeError when nothing is connected and there is no default, TypeError for a wrong message.
         """
-        port, evaluate, kind = self._sources[name]
+        port, evaluate, kind, default = self._sources[name]
         try:
             value = evaluate(self._context)
         except RuntimeError as error:
@@ -119,6 +115,7 @@ class Source(NamedTuple):
     port: Any  # of Drake's kind: HasValue, GetFullDescription
     evaluate: Callable[[Any], Any]  # (Context) or, in the player, (time): the value; looked up once
     kind: type  # of its values; object where Drake checks it
+    default: Any  # what it reads as while nothing is connected; _REQUIRED if that is an error
 
 
 def _kind(hint: Any) -> Kind:
@@ -168,19 +165,23 @@ class Block(LeafSystem, Generic[In, M]):
             else:
                 model = Value(kind()) if isinstance(kind, type) else kind
                 declared = self.DeclareAbstractInputPort(port, model)
-            self.sources[port] = Source(declared, declared.Eval, kind if isinstance(kind, type) else object)
+            annotated = getattr(self._inputs, port, None)
+            default = annotated.default if isinstance(annotated, _Port) else _REQUIRED
+            self.sources[port] = Source(declared, declared.Eval, kind if isinstance(kind, type) else object, default)
         self._memory = int(self.DeclareAbstractState(Value(Held(self.initial()))))
-        self._held: dict[str, int] = {}  # output port -> index of its state
+        self._messages: dict[str, int] = {}  # output port -> index of its abstract state
+        self._vectors: dict[str, int] = {}  # output port -> index of its discrete state
         first = self.initial_outputs()
         for port, kind in self.OUTPUTS.items():
             if isinstance(kind, int):
-                index = self.DeclareDiscreteState(first[port])
+                state = self.DeclareDiscreteState(first[port])
+                self._vectors[port] = int(state)
             elif isinstance(kind, type):
-                index = self.DeclareAbstractState(Value(first[port]))
+                state = self.DeclareAbstractState(Value(first[port]))
+                self._messages[port] = int(state)
             else:
                 raise TypeError(f"{name}.{port}: an output is a message class or the size of a vector")
-            self._held[port] = int(index)
-            self.DeclareStateOutputPort(port, index)
+            self.DeclareStateOutputPort(port, state)
         self.period = period
         self.schedule: list[tuple[float, float, Step]] = [
             (period, slot * SLOT + delay, self.step)
@@ -222,7 +223,7 @@ class Block(LeafSystem, Generic[In, M]):
         inputs = self._inputs(sources, where)
         activation = None
         if self.AWAKE is not None:
-            mode = inputs.read("mode", _REQUIRED)
+            mode = inputs["mode"]
             if mode.mode not in self.AWAKE:
                 activation = mode.activation
                 if held.asleep == activation:
@@ -235,20 +236,24 @@ class Block(LeafSystem, Generic[In, M]):
                 raise TypeError(f"{self.get_name()}.{port}: want {kind}, got {type(value).__name__}")
         return Held(memory, activation, held.value), outputs
 
-    def _update(self, work: "Step", context: Context, state: State) -> None:
-        held: Held = context.get_abstract_state(self._memory).get_value()
-        updated = self.update(work, context.get_time(), self.sources, context, held)
-        if updated is None:
-            return
-        held, outputs = updated
+    def _update(self, work: "Step", context: Context, state: State) -> EventStatus | None:
         abstract = state.get_mutable_abstract_state()
-        abstract.get_mutable_value(self._memory).set_value(held)
+        memory = abstract.get_mutable_value(self._memory)  # Drake has put there what is in `context`
+        updated = self.update(work, context.get_time(), self.sources, context, memory.get_value())
+        if updated is None:
+            return _ASLEEP
+        held, outputs = updated
+        memory.set_value(held)
         for port, value in outputs.items():
-            if isinstance(self.OUTPUTS[port], int):
-                state.get_mutable_discrete_state(self._held[port]).SetFromVector(np.asarray(value, float))
+            if port in self._messages:
+                abstract.get_mutable_value(self._messages[port]).set_value(value)
             else:
-                abstract.get_mutable_value(self._held[port]).set_value(value)
+                vector = state.get_mutable_discrete_state(self._vectors[port])
+                vector.SetFromVector(np.asarray(value, float))
+        return None
 
+
+_ASLEEP = EventStatus.DidNothing()  # where all blocks of an instant say so, Drake writes no state and forgets no value
 
 Step = Callable[[float, Any, Any], tuple[Any, Outputs]]
 

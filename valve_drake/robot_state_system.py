@@ -43,18 +43,20 @@ class RobotStateSystem(Block[Inputs, np.ndarray]):
 
     def step(self, time: float, inputs: Inputs, memory: np.ndarray) -> tuple[np.ndarray, Outputs]:
         read = {name: inputs[name] for name in self.INPUTS}
+        for vector in read.values():
+            vector.setflags(write=False)  # read once, kept by the message: or it would copy it
         odometry, torso = read["base.odometry"], read["torso.position_measured"]
         kept = memory[-(HISTORY - 1) :]
         history = np.empty((len(kept) + 1, 7))
         history[:-1] = kept
-        history[-1] = (time, *odometry[:3], *torso)
-        history.setflags(write=False)  # or the message would copy it
+        history[-1] = (time, *odometry.tolist()[:3], *torso.tolist())
+        history.setflags(write=False)  # as above
         sides: dict[str, Any] = {}
         for side in SIDES:
             sides[f"{side}_arm"] = read[f"{side}_arm.position_measured"]
             sides[f"{side}_arm_velocity"] = read[f"{side}_arm.velocity_measured"]
             sides[f"{side}_arm_torque"] = read[f"{side}_arm.torque_measured"]
-            sides[f"{side}_gripper"] = float(read[f"{side}_gripper.position_measured"][0])
-            sides[f"{side}_gripper_force"] = float(read[f"{side}_gripper.force_measured"][0])
+            sides[f"{side}_gripper"] = read[f"{side}_gripper.position_measured"].item()
+            sides[f"{side}_gripper_force"] = read[f"{side}_gripper.force_measured"].item()
             sides[f"{side}_wrench"] = read[f"{side}_wrist.wrench"]
         return history, {"robot_state": RobotState(time=time, odometry=odometry, torso=torso, history=history, **sides)}
