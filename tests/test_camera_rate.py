@@ -117,6 +117,11 @@ def test_whatever_is_configured_a_slow_camera_does_not_look_dead(age, floor):
     assert max(gaps) < age
 
 
+def test_the_age_of_a_camera_that_is_not_named_is_that_of_other_devices():
+    config = SupervisorConfig(max_age={"head_left": 0.5})
+    assert (config.oldest("head_left"), config.oldest("head_right")) == (0.5, config.other_age)
+
+
 @pytest.mark.parametrize("key", ["head_period", "wrist_period"])
 def test_a_camera_that_would_look_dead_by_its_own_period_is_refused(key):
     words = (

@@ -420,6 +420,13 @@ def test_a_camera_without_images_is_named_before_it_looks_dead(monkeypatch):
             pass
     words = "the twin has not made an image of "
     slow = [any(name.startswith(words) for name in names) for names in faults]
+    assert not any(name.endswith("slower than real time") for name in faults[-1])
+    rate.judge(0.6, {})
+    for _ in range(5):
+        twin.report()
+        twin.move()
+    bus.pump()
+    assert "the twin is 60 % slower than real time" in faults[-1], "and the program is told why"
     first = slow.index(True) * scenario.hardware.robot_period
     assert all(slow[slow.index(True) :]) and first < scenario.supervisor.max_age["head_left"] - 0.1
 

@@ -19,6 +19,7 @@ from valve_drake.scenario import Scenario, resolve
 from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_rate import CameraRate, limits
 from valve_drake.stations.camera_workers import CameraWorkers
+from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.faults import Faults
 from valve_drake.stations.hardware import RobotLink
 from valve_drake.stations.reports import listed
@@ -100,7 +101,8 @@ def run_twin(
     scenario.check()
     cv2.setNumThreads(1)
     lockstep = scenario.hardware.lockstep
-    rate = CameraRate(limits(scenario.simulation.camera, scenario.supervisor.max_age), notice)
+    ages = {camera: scenario.supervisor.oldest(camera) for camera in CAMERAS}
+    rate = CameraRate(limits(scenario.simulation.camera, ages), notice)
     with (CameraWorkers if lockstep else LiveImages)(*rig_of(scenario)) as workers:
         twin = make_twin(scenario, workers=workers, rate=rate)
         begin = float(twin.read("truth.valve_angle")[0])

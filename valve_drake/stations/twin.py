@@ -76,7 +76,7 @@ BACK = 0.3  # speed of a joint that was stopped, back to its commands [rad/s]
 GONE = 3.0  # paced: a program that was silent for this long counts as gone; raise it for a slow one [s]
 IDLE = 0.05  # lock-step: time between two reports before the start [s, wall clock]
 PATIENCE = {"cameras": 0.1, "controller": math.inf}  # of what does not come every tick (reports.py) [s]
-MARGIN = 0.2  # a camera without images is named so long before the program would call it dead [s]
+NAMED = 0.8  # a camera without images is named at this share of the age at which the program would call it dead
 OVERDUE = 0.2  # an image that is under way for longer needs help [s, wall]
 STARTING = 3.0  # the user is told if the first images take longer than this [s, wall clock]
 
@@ -424,7 +424,7 @@ class Twin:
             return []
         words = [self._rate.trouble] if self._rate.trouble else []
         silence, camera = self._images.longest_silence()
-        limit = self._rate.limits.age - MARGIN
+        limit = NAMED * self._rate.limits.age
         return words + ([f"the twin has not made an image of {camera} for {limit:g} s"] if silence > limit else [])
 
     def fell_behind(self, total: float) -> None:

@@ -68,6 +68,10 @@ class SupervisorConfig(Config):
     report_age: float = number(0.25, 0.05, 0.25, "the same for the health and selector reports themselves [s]")
     angle_limit: float = number(12.6, 0.01, 12.6, "largest turn that an operator may ask for [rad]")
 
+    def oldest(self, device: str) -> float:
+        """How old the last report of a device may be [s]."""
+        return self.max_age.get(device, self.other_age)
+
 
 @dc.dataclass(frozen=True)
 class State:
@@ -159,7 +163,7 @@ def find_fault(config: SupervisorConfig, time: float, health: Health | None, sel
     if health.faults:
         return "fault: " + ", ".join(health.faults)
     for device, age in zip(health.devices, health.ages):
-        if not age <= config.max_age.get(device, config.other_age):
+        if not age <= config.oldest(device):
             return f"{device} silent for {age:.2f} s"
     if selector is not None:
         if not time - selector.time <= config.report_age:
