@@ -76,12 +76,12 @@ def test_jacobians_are_those_of_the_differences(to_hand):
     X_BE = [frames.inverse(X) for X in hand_poses(4)] if to_hand else hand_poses(4)
     corners = [board_seen(frames.inverse(X) if to_hand else X) for X in X_BE]
     seen = hand_eye.observe(PAPER, BOARD.points(), corners, X_BE, to_hand)
-    X = hand_eye.stepped(X_EC, rng.normal(0, 1e-3, 6))
+    X = frames.stepped(X_EC, rng.normal(0, 1e-3, 6))
     e, J, _ = hand_eye._arm_errors(X, X_BT, seen)
     for k in range(12):
         step = np.zeros(12)
         step[k] = 1e-6
-        there = hand_eye._arm_errors(hand_eye.stepped(X, step[:6]), hand_eye.stepped(X_BT, step[6:]), seen)[0]
+        there = hand_eye._arm_errors(frames.stepped(X, step[:6]), frames.stepped(X_BT, step[6:]), seen)[0]
         np.testing.assert_allclose((there - e) / 1e-6, J[:, :, k], atol=2e-5)
 
 

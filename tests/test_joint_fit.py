@@ -6,8 +6,8 @@ import pytest
 from valve_drake import frames
 from valve_drake.analysis import experiments
 from valve_drake.analysis.drawn_images import PLATE, RED, Canvas, draw_board
+from valve_drake.perception import edges, line_fitting
 from valve_drake.perception import joint_fit as mut
-from valve_drake.perception import line_fitting
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.quadrilateral import side_lines
@@ -78,7 +78,7 @@ def test_covariance_does_not_depend_on_the_blur_that_was_looked_for_first(monkey
     X, found = pose(1.2, 0.6), []
     image = canvas(X).finish(np.random.default_rng(3), 2.0)
     for blur in (0.65, 0.78, 0.95):
-        monkeypatch.setattr(line_fitting, "_START_BLUR", blur)
+        monkeypatch.setattr(edges, "START_BLUR", blur)
         found.append(np.linalg.inv(fit(image, X).information).diagonal())
     np.testing.assert_allclose(found, [found[1]] * 3, rtol=0.01)
 
@@ -159,7 +159,7 @@ def test_jacobian_of_the_corner_pixels_equals_finite_differences():
 @pytest.mark.parametrize("beside", [False, True])  # one that is found out only when the sides are fitted
 def test_two_quadrilaterals_in_one_pass_are_fitted_as_each_alone(beside, monkeypatch):
     # Coarse lines are looked for at the resolution that suits the smallest: the same start, then, for both.
-    monkeypatch.setattr(line_fitting, "_hough_corners", lambda sheet, corners: corners)
+    monkeypatch.setattr(line_fitting, "hough_corners", lambda sheet, corners: corners)
     rng, near, far = np.random.default_rng(4), pose(0.7), pose(1.6)
     images = [canvas(X).finish(rng, 2.0) for X in (near, far)]
     corners = [EYE.project(true_corners(X)) for X in (near, far)]

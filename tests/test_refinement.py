@@ -10,8 +10,9 @@ from drawn_scene import edge_points, facing, nees, off_the_epipolar_line, pose_e
 from valve_drake import frames
 from valve_drake.camera.lens import load_head
 from valve_drake.perception.marker import Marker
+from valve_drake.perception.moments import moments_of, robust_weights
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
-from valve_drake.perception.refinement import linearize, moments_of, robust_weights
+from valve_drake.perception.refinement import linearize
 from valve_drake.perception.views import views_of
 
 ROOT = pathlib.Path(__file__).parents[1]

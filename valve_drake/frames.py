@@ -20,6 +20,9 @@ import math
 
 import numpy as np
 
+_SKEW = np.zeros((3, 9))  # v @ _SKEW is [v]x row by row
+_SKEW[0, [7, 5]], _SKEW[1, [2, 6]], _SKEW[2, [3, 1]] = (1, -1), (1, -1), (1, -1)
+
 
 def rotation_vector(R: np.ndarray) -> np.ndarray:
     """Axis times angle of a rotation matrix (3, 3) -> (3,), angle in [0, pi]."""
@@ -56,8 +59,8 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def skew(v: np.ndarray) -> np.ndarray:
-    """[v]x with [v]x u = v cross u."""
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    """[v]x with [v]x u = v cross u: (..., 3) -> (..., 3, 3)."""
+    return (v @ _SKEW).reshape(*np.shape(v)[:-1], 3, 3)
 
 
 def rot_x(a: float) -> np.ndarray:
@@ -93,6 +96,11 @@ def compose(*X: np.ndarray) -> np.ndarray:
 def inverse(X: np.ndarray) -> np.ndarray:
     """X_AB -> X_BA (3, 4)."""
     return make(X[:, :3].T, -X[:, :3].T @ X[:, 3])
+
+
+def stepped(X: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """X (3, 4) turned about its own axes by step[:3] [rad], and displaced by step[3:] [m]."""
+    return make(X[:, :3] @ rotation(step[:3]), X[:, 3] + step[3:])
 
 
 def apply(X: np.ndarray, p: np.ndarray) -> np.ndarray:

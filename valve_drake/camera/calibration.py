@@ -26,10 +26,11 @@ import numpy as np
 
 from valve_drake import frames
 from valve_drake.camera.board import Board
-from valve_drake.camera.least_squares import divided, minimize, skew, stepped, transform
 from valve_drake.camera.lens import KNOWN, Lens, OpenCvLens, StereoHead, check_baseline
+from valve_drake.camera.projection import divided, transform
 from valve_drake.camera.triangulation import triangulate_all
 from valve_drake.checks import ConfigError
+from valve_drake.least_squares import minimize
 
 KINDS = ("opencv", "paper")
 RANGES = (0.5, 1.0, 2.0)  # at which points are triangulated [m]
@@ -210,7 +211,9 @@ class _Problem:
         for view in self.views:
             X_LT = state.poses[view.body]
             P = frames.apply(X_LT, view.points)
-            dP = np.concatenate([-X_LT[:, :3] @ skew(view.points), np.broadcast_to(np.eye(3), (len(P), 3, 3))], 2)
+            dP = np.concatenate(
+                [-X_LT[:, :3] @ frames.skew(view.points), np.broadcast_to(np.eye(3), (len(P), 3, 3))], 2
+            )
             mine = slice(self.shared + 6 * view.body, self.shared + 6 * view.body + 6)
             residuals.append([])
             for c, (lens, px) in enumerate(zip(lenses, view.px)):
@@ -218,7 +221,7 @@ class _Problem:
                 if c == 1 and state.X_LR is not None:
                     R = state.X_LR[:, :3]
                     Q, dQ = (P - state.X_LR[:, 3]) @ R, R.T @ dP
-                    dX = np.concatenate([skew(Q), np.broadcast_to(-R.T, (len(Q), 3, 3))], 2)
+                    dX = np.concatenate([frames.skew(Q), np.broadcast_to(-R.T, (len(Q), 3, 3))], 2)
                 if not (Q[:, 2] > 1e-6).all():
                     return math.inf, H, g, residuals
                 xy = Q[:, :2] / Q[:, 2:]
@@ -240,9 +243,9 @@ class _Problem:
 
     def moved(self, state: _State, step: np.ndarray) -> _State:
         lenses = tuple(p + step[c * self.m : (c + 1) * self.m] for c, p in enumerate(state.lenses))
-        X_LR = None if state.X_LR is None else stepped(state.X_LR, step[self.shared - 6 : self.shared])
+        X_LR = None if state.X_LR is None else frames.stepped(state.X_LR, step[self.shared - 6 : self.shared])
         poses = step[self.shared :].reshape(-1, 6)
-        return _State(lenses, X_LR, tuple(stepped(X, s) for X, s in zip(state.poses, poses)))
+        return _State(lenses, X_LR, tuple(frames.stepped(X, s) for X, s in zip(state.poses, poses)))
 
     def names(self) -> tuple[str, ...]:
         if self.cameras == 1:
@@ -254,6 +257,8 @@ class _Problem:
 def _solve(views: Sequence[View], kind: _Kind, name: str, start: _State, size: tuple[int, int]) -> Fit:
     problem = _Problem(views, kind, size)
     state, (cost, H, _, residuals) = minimize(problem, start, problem.moved)
+    if not math.isfinite(cost):
+        raise ConfigError("the calibration has no start: do the images, and the poses, belong together?")
     corners = sum(len(r) for view in residuals for r in view)
     scale = np.sqrt(np.diag(H)) + 1e-150
     # A direction that the corners do not determine gets a huge standard deviation instead of an error.
@@ -467,7 +472,7 @@ def _sigma_maps(opencv: Fit, fit: Fit, views: Sequence[View], size: tuple[int, i
             _, D, by_lens = kind.project(lens, xy)
             rays = np.column_stack([xy, np.ones(len(xy))])
             J.append(by_lens)
-            turn.append(D @ divided(xy, np.ones(len(xy))) @ -skew(rays))
+            turn.append(D @ divided(xy, np.ones(len(xy))) @ -frames.skew(rays))
             other.append((chosen.project(xy) - px)[..., None])
         back = np.linalg.pinv(turn[0].reshape(-1, 3))
         J_left = J[1] - turn[1] @ (back @ J[0].reshape(-1, len(kind.names)))

@@ -25,8 +25,8 @@ import cv2
 import numpy as np
 
 from valve_drake import frames
-from valve_drake.camera.least_squares import divided, skew, stepped, transform
 from valve_drake.camera.lens import LensModel
+from valve_drake.camera.projection import divided, transform
 from valve_drake.checks import ConfigError
 
 Poses: TypeAlias = Sequence[np.ndarray] | np.ndarray  # (n, 3, 4)
@@ -146,7 +146,7 @@ class _BoardPose(NamedTuple):
 
 def _boards(lens: LensModel, points: np.ndarray, px: np.ndarray) -> list[_BoardPose]:
     """The one or two poses that explain the corners, the better one first. Raises ConfigError if there is none."""
-    xy, S = lens.normalize(px), skew(points)
+    xy, S = lens.normalize(px), frames.skew(points)
     to_px = np.linalg.inv(lens.normalize_jacobian(px))  # the corners' noise is the same all over the raw image
     out = []
     for rvec, tvec in zip(*cv2.solvePnPGeneric(points, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)[1:3]):
@@ -158,7 +158,7 @@ def _boards(lens: LensModel, points: np.ndarray, px: np.ndarray) -> list[_BoardP
             J = (to_px @ divided(at, P[:, 2]) @ dP).reshape(-1, 6)
             r = (to_px @ (at - xy)[:, :, None]).ravel()
             H = J.T @ J
-            X = stepped(X, -np.linalg.solve(H, J.T @ r))
+            X = frames.stepped(X, -np.linalg.solve(H, J.T @ r))
         if np.isfinite(X).all() and X[2, 3] > 0:
             out.append(_BoardPose(X, H, float(r @ r)))
     if not out:
@@ -231,17 +231,17 @@ def _arm_errors(X: np.ndarray, Y: np.ndarray, seen: Seen) -> tuple[np.ndarray, n
         at = R_Z @ hand + p_Z
         R, p = R_X @ R_Z @ R_Y.T, at @ R_X.T + p_X
         by_Z = (R_Y, -R_X @ R_Z @ frames.skew(hand), R_X)
-        by_X = (R_Y @ _T(R_Z), -R_X @ skew(at), one)
+        by_X = (R_Y @ _T(R_Z), -R_X @ frames.skew(at), one)
         by_Y = (-R_Y, R_X @ R_Z @ frames.skew(hand), -R)
     else:  # X_BE = Y Z^-1 X^-1
         hand = -R_X.T @ p_X  # E's origin in C, in T, in B
         at = (_T(R_Z) @ (hand - p_Z)[:, :, None])[:, :, 0]
         R, p = R_Y @ _T(R_Z) @ R_X.T, at @ R_Y.T + p_Y
-        by_Z = (-R_X @ R_Z, R_Y @ skew(at), -R_Y @ _T(R_Z))
+        by_Z = (-R_X @ R_Z, R_Y @ frames.skew(at), -R_Y @ _T(R_Z))
         by_X = (-R_X, R_Y @ _T(R_Z) @ frames.skew(hand), -R)
-        by_Y = (R_X @ R_Z, -R_Y @ skew(at), one)
+        by_Y = (R_X @ R_Z, -R_Y @ frames.skew(at), one)
     w = np.array([frames.rotation_vector(mine.T @ other) for mine, other in zip(seen.arm[:, :, :3], R)])
-    turn = np.eye(3) + skew(w) / 2  # d log(exp(w) exp(d)) / d d, to first order in w
+    turn = np.eye(3) + frames.skew(w) / 2  # d log(exp(w) exp(d)) / d d, to first order in w
 
     def jacobian(ww: np.ndarray, tw: np.ndarray, tt: np.ndarray) -> np.ndarray:
         J = np.zeros((n, 6, 6))
@@ -271,7 +271,7 @@ def solve(seen: Seen, X: np.ndarray | None = None) -> Fit:
             raise ConfigError("hand-eye: no solution; do the poses belong to the images?")
         # Poses of other images start far off: a step is limited to a rotation in which the problem is nearly linear.
         step *= min(1.0, _MAX_TURN / max(np.abs(step[[0, 1, 2, 6, 7, 8]]).max(), 1e-12))
-        X, Y = stepped(X, step[:6]), stepped(Y, step[6:])
+        X, Y = frames.stepped(X, step[:6]), frames.stepped(Y, step[6:])
         covariance = np.tensordot(weights, covariances, 1) + (weights * (steps - step).T) @ (steps - step)
         if step @ np.linalg.solve(covariance, step) < 1e-6:
             break
@@ -285,7 +285,7 @@ def _solve_known(seen: Seen, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(10):
         e, B, V = _arm_errors(X, Y, seen)
         steps, covariances, _ = _least_squares(e, B, V, fit.variances[None])
-        X, Y = stepped(X, steps[0, :6]), stepped(Y, steps[0, 6:])
+        X, Y = frames.stepped(X, steps[0, :6]), frames.stepped(Y, steps[0, 6:])
         if steps[0] @ np.linalg.solve(covariances[0], steps[0]) < 1e-6:
             break
     return X, Y

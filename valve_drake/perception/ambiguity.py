@@ -13,9 +13,10 @@ import numpy as np
 
 from valve_drake import frames
 from valve_drake.perception.marker import NEXT, Marker
+from valve_drake.perception.moments import Moments
 from valve_drake.perception.paper import closed_form
 from valve_drake.perception.rectangle_config import RectangleEstimatorConfig
-from valve_drake.perception.refinement import Fit, Moments, linearize, refine
+from valve_drake.perception.refinement import Fit, linearize, refine
 from valve_drake.perception.views import View
 
 _PRUNE_CHI2 = 1000.0  # a start whose chi^2 is this much above the best one's is not refined
@@ -52,7 +53,7 @@ def candidates(views: list[View], moments: Moments, model: np.ndarray, config: R
     if len(fits) == 1 and math.isfinite(pruned[0][0]):
         # If the mirrored tilt has no minimum of its own, its best translation is the alternative.
         cost, R = pruned[0]
-        fits.append(dc.replace(fits[0], R=R, cost=max(cost, fits[0].cost), at=None))
+        fits.append(dc.replace(fits[0], R=R, cost=max(cost, fits[0].cost), gradient=None))
     return fits
 
 
@@ -162,5 +163,6 @@ def _quarter_turned(moments: Moments, fits: list[Fit], marker: Marker, config: R
 def _half_turned(fit: Fit) -> Fit:
     sign = np.ones(len(fit.information))
     sign[:2] = -1  # theta is in V
-    at = (fit.at[0], fit.at[1] * sign) if fit.at else None
-    return dc.replace(fit, R=fit.R @ HALF_TURN, information=fit.information * np.outer(sign, sign), at=at)
+    gradient = None if fit.gradient is None else fit.gradient * sign
+    information = fit.information * np.outer(sign, sign)
+    return dc.replace(fit, R=fit.R @ HALF_TURN, information=information, gradient=gradient)

@@ -15,7 +15,8 @@ from valve_drake.perception.color_segmentation import (
     RegionConfig,
     green_regions,
 )
-from valve_drake.perception.line_fitting import SidesConfig, fit_quads
+from valve_drake.perception.edges import SidesConfig
+from valve_drake.perception.line_fitting import fit_quads
 from valve_drake.perception.marker import NEXT
 from valve_drake.perception.quadrilateral import from_outline, meet, middle, polygon_area, side_lines
 

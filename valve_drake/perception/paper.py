@@ -162,5 +162,5 @@ def paper_pose(
         if exact is not None:
             columns.append(np.append(np.zeros(3), exact[1] - p))
     J = np.array(columns)
-    fit = Fit(R=R, p=p, yaw=0.0, cost=0.0, information=np.eye(6), prior=np.zeros(6))
+    fit = Fit(R=R, p=p, yaw=0.0, cost=0.0, information=np.eye(6))
     return fit, J.T @ J, ""

@@ -6,6 +6,7 @@ rectangle by least squares, from both mirrored tilts (perception/ambiguity.py), 
 Frames: L left head camera, V marker. Side k joins corner k and k + 1, clockwise as seen (perception/marker.py).
 """
 
+import dataclasses as dc
 import math
 
 import numpy as np
@@ -16,18 +17,11 @@ from valve_drake.messages import MarkerEdges, RectangleEstimate
 from valve_drake.perception.ambiguity import Track, candidates, settle_axis
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.matching import epipolar_offset
+from valve_drake.perception.moments import Moments, moments_of, point_residuals, robust_weights
 from valve_drake.perception.paper import paper_pose
-from valve_drake.perception.quadrilateral import middle
+from valve_drake.perception.quadrilateral import COUNTED_FROM, middle
 from valve_drake.perception.rectangle_config import RectangleEstimatorConfig
-from valve_drake.perception.refinement import (
-    Fit,
-    covariance_of,
-    moments_of,
-    other_camera_step,
-    point_residuals,
-    refine,
-    robust_weights,
-)
+from valve_drake.perception.refinement import Fit, covariance_of, other_camera_step, refine
 from valve_drake.perception.views import View, views_of
 
 __all__ = ["RectangleEstimatorConfig", "Track", "estimate"]
@@ -63,65 +57,38 @@ def _estimate(
     views, reason = views_of(edges, head, config)
     if reason:
         return _refuse(edges, config, reason)
-    weights = [view.trust for view in views]
-    moments = moments_of(views, weights, config)
-    model = marker.corners()
-    fits = candidates(views, moments, model, config)
+    moments = moments_of(views, [view.trust for view in views], config)
+    fits = candidates(views, moments, marker.corners(), config)
     if not fits:
         return _refuse(edges, config, "no pose explains the sides")
     if track is not None and len(fits) > 1 and fits[1].cost - fits[0].cost < config.ambiguity_gate:
         fits.sort(key=lambda fit: -fit.R[:, 2] @ track.X_LV[:, 2])
     turn, axis_known, fits = settle_axis(views, moments, fits, marker, config, track)
-    model = model[(np.arange(4) + turn) % 4]
-    best = fits[0]
-    ambiguity = fits[1].cost - best.cost if len(fits) > 1 else 0.0
-    if config.method == "paper":
-        step, refined = other_camera_step(moments, model, best), best
-        fit, paper_covariance, reason = paper_pose(views, model, config)
-        if fit is None or paper_covariance is None:
-            return _refuse(edges, config, reason)
-        best, covariance = fit, paper_covariance
-        inflation = 1.0
-        if step is not None:  # from this pose to the one that the other camera makes of the refined one
-            step = np.append(frames.rotation_vector(best.R.T @ refined.R), refined.p - best.p) + step
-    else:
-        told = all(view.information.any() for view in views)
-        if not told:
-            weights = [robust_weights(view, point_residuals(view, best, model), config) for view in views]
-            moments = moments_of(views, weights, config)
-        fit = refine(moments, model, best.R, best.p, best.yaw, config, at=best.at if told else None)
-        if fit is None:
-            return _refuse(edges, config, "no pose explains the sides")
-        best = fit
-        covariance = covariance_of(moments, model, best)
-        # Misfit of whole sides, that independent points do not show: calibration, a marker that is not flat.
-        inflation = (best.cost - moments.floor) / (8 * len(views) - 6)
-        step = other_camera_step(moments, model, best)
-    square = sum(float((w * point_residuals(v, best, model) ** 2).sum()) for v, w in zip(views, weights))
-    residual = math.sqrt(square / max(sum(float(w.sum()) for w in weights), 1e-9))
-    if inflation > _chance(8 * len(views) - 6):
-        covariance, ambiguity = covariance * inflation, ambiguity / inflation
-    reason = _gate(views, best, residual, config)
-    if step is not None:
-        # Either the right camera is not as calibrated, which `step` makes good, or the marker is of another size, and
-        # the triangulated distance is right: the covariance holds both.
-        other_size = np.append(np.zeros(3), (_triangulated_distance(views) / math.hypot(*best.p) - 1) * best.p)
-        covariance = covariance + np.outer(step, step) + np.outer(other_size, other_size)
-    X_LV = frames.make(best.R, best.p)
-    X_other = frames.make(fits[1].R, fits[1].p) if len(fits) > 1 else X_LV
+    model = marker.corners()[COUNTED_FROM[turn]]
+    pose_by = _paper if config.method == "paper" else _refined
+    pose = pose_by(views, moments, model, fits[0], config)
+    if isinstance(pose, str):
+        return _refuse(edges, config, pose)
+    fit, covariance = pose.fit, pose.covariance
+    residual = _residual_px(views, pose, model)
+    reason = _gate(views, fit, residual, config)
+    ambiguity = fits[1].cost - fits[0].cost if len(fits) > 1 else 0.0
+    if pose.misfit > _chance(8 * len(views) - 6):
+        covariance, ambiguity = covariance * pose.misfit, ambiguity / pose.misfit
+    if pose.other_camera is not None:
+        covariance = _contradicted(covariance, pose, _triangulated_distance(views))
     if len(fits) > 1 and track is None and ambiguity < config.ambiguity_gate and config.method == "refined":
-        # Nothing decides between the two tilts: the covariance holds the other one with its probability.
-        other = np.append(frames.rotation_vector(best.R.T @ fits[1].R), fits[1].p - best.p)
-        covariance = covariance + np.outer(other, other) / (1 + math.exp(max(ambiguity, 0.0) / 2))
+        covariance = covariance + _either_tilt(fit, fits[1], ambiguity)
+    other = fits[1] if len(fits) > 1 else fit
     return RectangleEstimate(
         time=edges.time,
         sequence=edges.sequence,
         found=not reason,
         method=config.method,
         cameras=len(views),
-        X_LV=X_LV,
+        X_LV=frames.make(fit.R, fit.p),
         covariance=(covariance + covariance.T) / 2,
-        X_LV_other=X_other,
+        X_LV_other=frames.make(other.R, other.p),
         ambiguity=float(ambiguity),
         residual_px=residual,
         axis_known=axis_known,
@@ -129,6 +96,89 @@ def _estimate(
         corners_right=edges.right.corners_px if edges.right.found else np.zeros((0, 2)),
         reason=reason,
     )
+
+
+@dc.dataclass(frozen=True)
+class _Pose:
+    """The pose by one of the methods, and what its covariance must still be widened by."""
+
+    fit: Fit
+    covariance: np.ndarray  # (6, 6) of theta [rad] and p [m]
+    weights: list[np.ndarray]  # of each view's edge points
+    misfit: float  # chi^2 per degree of freedom of whole sides, which independent points do not show
+    other_camera: np.ndarray | None  # (6,) step that makes good a right camera not as calibrated, if the sides ask it
+
+
+def _refined(
+    views: list[View], moments: Moments, model: np.ndarray, start: Fit, config: RectangleEstimatorConfig
+) -> _Pose | str:
+    """By least squares from the best candidate on; or why not."""
+    weights = [view.trust for view in views]
+    told = all(view.information.any() for view in views)
+    if not told:
+        weights = [
+            robust_weights(view, point_residuals(view, start.R, start.p, start.yaw, model), config) for view in views
+        ]
+        moments = moments_of(views, weights, config)
+    fit = refine(moments, model, start.R, start.p, start.yaw, config, known=start if told else None)
+    if fit is None:
+        return "no pose explains the sides"
+    return _Pose(
+        fit=fit,
+        covariance=covariance_of(moments, model, fit),
+        weights=weights,
+        # The cause is the calibration, or a marker that is not flat.
+        misfit=(fit.cost - moments.floor) / (8 * len(views) - 6),
+        other_camera=other_camera_step(moments, model, fit),
+    )
+
+
+def _paper(
+    views: list[View], moments: Moments, model: np.ndarray, refined: Fit, config: RectangleEstimatorConfig
+) -> _Pose | str:
+    """By the closed form; or why not. refined: the best candidate, which shows whether the cameras contradict."""
+    step = other_camera_step(moments, model, refined)
+    fit, covariance, reason = paper_pose(views, model, config)
+    if fit is None or covariance is None:
+        return reason
+    if step is not None:  # from this pose to the one that the other camera makes of the refined one
+        step = _difference(fit, refined) + step
+    return _Pose(fit, covariance, [view.trust for view in views], misfit=1.0, other_camera=step)
+
+
+def _difference(fit: Fit, other: Fit) -> np.ndarray:
+    """(6,) the step of theta [rad] and p [m] from one pose to the other."""
+    return np.append(frames.rotation_vector(fit.R.T @ other.R), other.p - fit.p)
+
+
+def _residual_px(views: list[View], pose: _Pose, model: np.ndarray) -> float:
+    """Root mean square of the edge points' distances from the projected rectangle [px]."""
+    square = 0.0
+    for view, weight in zip(views, pose.weights):
+        off = point_residuals(view, pose.fit.R, pose.fit.p, pose.fit.yaw, model)
+        square += float((weight * off**2).sum())
+    return math.sqrt(square / max(sum(float(weight.sum()) for weight in pose.weights), 1e-9))
+
+
+def _contradicted(covariance: np.ndarray, pose: _Pose, distance: float) -> np.ndarray:
+    """The covariance (6, 6) where the cameras contradict each other; distance: of the marker, by triangulation [m].
+
+    Either the right camera is not as calibrated, which `other_camera` makes good, or the marker is of another size, and
+    the triangulated distance is right: it holds both.
+    """
+    assert pose.other_camera is not None
+    p = pose.fit.p
+    other_size = np.append(np.zeros(3), (distance / math.hypot(*p) - 1) * p)
+    return covariance + np.outer(pose.other_camera, pose.other_camera) + np.outer(other_size, other_size)
+
+
+def _either_tilt(fit: Fit, other: Fit, ambiguity: float) -> np.ndarray:
+    """Covariance (6, 6) of two tilts that nothing decides between: the other one with its probability.
+
+    ambiguity: chi^2 by which it fits worse.
+    """
+    off = _difference(fit, other)
+    return np.outer(off, off) / (1 + math.exp(max(ambiguity, 0.0) / 2))
 
 
 def _chance(freedom: int) -> float:
