@@ -654,6 +654,18 @@ def test_a_dae_with_entities_is_not_read(tmp_path, capsys):
     assert "a DAE with a document type, or not in UTF-8, is not read" in capsys.readouterr().err
 
 
+@needs_trimesh
+def test_a_dae_whose_material_is_broken_keeps_its_shape(tmp_path, capsys):
+    dae(tmp_path / "a.dae")
+    text = (tmp_path / "a.dae").read_text()
+    (tmp_path / "a.dae").write_text(text.replace('<instance_effect url="#e"/>', '<instance_effect url="#nothing"/>'))
+    paint = '<material name="Mine"><color rgba="0.1 0.2 0.3 1"/></material>'
+    code, folder = imported(tmp_path, mesh_link("a.dae", extra=paint))
+    assert code == 0 and len(obj_of(folder, "a.obj")[3]) == 36
+    assert "note: mesh a.dae: its materials are broken" in capsys.readouterr().out
+    assert 'name="Mine"' in (folder / "thing.urdf").read_text()
+
+
 def test_without_the_mesh_reader_the_line_says_what_to_install(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     monkeypatch.setitem(sys.modules, "collada", None)
@@ -708,6 +720,25 @@ def test_the_report_is_one_object_for_programs(tmp_path, capsys):
     report = json.loads(capsys.readouterr().out)
     assert code == 0 and report["robot"] == "thing" and report["urdf"] == str(folder / "thing.urdf")
     assert set(report) >= {"files", "mended", "notes", "todo", "links", "joints", "meshes", "mesh_bytes", "seconds"}
+
+
+def test_the_picture_shows_the_robot_and_is_overwritten_only_if_asked(tmp_path, capsys):
+    import cv2
+
+    paint = '<material name="Mine"><color rgba="0.9 0.1 0.1 1"/></material>'
+    parts, picture = link("a", MASS + f"<visual>{BOX}{paint}</visual>"), tmp_path / "a.png"
+    code, folder = imported(tmp_path, parts, arguments=["--picture", str(picture)])
+    image = cv2.imread(str(picture)).astype(float)
+    assert code == 0 and image.shape == (600, 960, 3)
+    red = (image[:, :, 2] > 2 * image[:, :, 1]) & (image[:, :, 2] > 60)
+    for half in (red[:, :480], red[:, 480:]):
+        assert 0.05 < half.mean() < 0.6, "the box fills a good part of each view"
+    before = picture.read_bytes()
+    assert imported(tmp_path, parts, arguments=["--picture", str(picture)])[0] == 2
+    assert "--picture must be a file that does not exist yet" in capsys.readouterr().err
+    assert picture.read_bytes() == before
+    urdf_of = str(tmp_path / "thing.urdf")
+    assert imported(tmp_path, parts, arguments=["--overwrite", "--picture", urdf_of])[0] == 2, "never over the model"
 
 
 # ---------------------------------------------------------------- the draft
@@ -791,6 +822,15 @@ def test_the_sides_are_told_by_any_usual_name(left, right):
     guess = drafting.guess(found, {}, {}, [])
     assert guess.arms["left"][0] == f"{left}_arm_1_joint" and len(guess.arms["right"]) == 7
     assert guess.second_eye == f"{right}_eye_optical_frame"
+
+
+def test_legs_are_no_arms_and_a_wrist_may_be_named_after_its_gripper():
+    renamed = [part.replace("_arm_5", "_gripper_yaw") for part in two_arms(5)]
+    legs = [part.replace("_arm_", "_knee_") for part in two_arms(7) if "_arm_" in part and "ft_sensor" not in part]
+    found = read(*renamed, *legs)
+    mend(found)
+    arms = drafting.find_arms(found)
+    assert arms["left"] == [*(f"left_arm_{k}_joint" for k in range(1, 5)), "left_gripper_yaw_joint"]
 
 
 def test_the_draft_says_what_it_cannot_know(tmp_path, capsys):

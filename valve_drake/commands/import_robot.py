@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from valve_drake.commands.common import OK, Subcommands
+from valve_drake.commands.common import OK, Subcommands, check_rendering
 from valve_drake.console import say
 
 
@@ -18,6 +18,7 @@ def add(commands: Subcommands) -> None:
     p.add_argument("model", metavar="MODEL.urdf", help="a path, or package://NAME/path")
     p.add_argument("-o", "--out", type=Path, metavar="DIR", help="the folder (default: the robot's name)")
     p.add_argument("--overwrite", action="store_true", help="files in DIR may exist, robot.yaml too: they are replaced")
+    p.add_argument("--picture", type=Path, metavar="PNG", help="a picture of the model, from ahead and from behind")
     p.add_argument("--json", action="store_true", help="print the report as one JSON object")
     p.set_defaults(command=command)
 
@@ -25,7 +26,9 @@ def add(commands: Subcommands) -> None:
 def command(options: argparse.Namespace) -> int:
     from valve_drake.robot.importing import import_robot
 
-    report = import_robot(options.model, options.out, options.overwrite)
+    if options.picture:
+        check_rendering()
+    report = import_robot(options.model, options.out, options.overwrite, options.picture)
     if options.json:
         print(json.dumps(report.as_dict()))
     else:

@@ -24,6 +24,7 @@ _SIDE = re.compile(r"left|right|Left|Right|LEFT|RIGHT|(?<![A-Za-z0-9])[lrLR](?![
 _OTHER = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
 _OTHER |= {right: left for left, right in _OTHER.items()}
 _FINGER = re.compile(r"grip|finger|thumb|jaw|knuckle|hand", re.IGNORECASE)
+_LEG = re.compile(r"(?<![a-z])(hip|leg|thigh|knee|calf|ankle|foot)(?![a-z])|_(hip|leg)_", re.IGNORECASE)
 _CAMERA = re.compile(r"camera|(?<![a-z])cam(?![a-z])|optical|stereo|(?<![a-z])eye|zed|realsense|kinect", re.IGNORECASE)
 _MOUNT = re.compile(r"screw|mount|base", re.IGNORECASE)
 _FORCE = re.compile(r"(?<![a-z])ft(?![a-z])|force|torque|wrench|sensor", re.IGNORECASE)
@@ -130,13 +131,19 @@ def find_arms(robot: Robot) -> dict[str, list[str]]:
     best: list[str] = []
     for joint in robot.joints.values():
         twin = robot.joints.get(mirrored(joint.name))
-        if not joint.moving or side_of(joint.name) != "left" or twin is None or not twin.moving:
+        if (
+            not joint.moving
+            or _LEG.search(joint.name)
+            or side_of(joint.name) != "left"
+            or twin is None
+            or not twin.moving
+        ):
             continue
         chain, current = [joint.name], joint
         while len(following := _next(robot, current.child)) == 1:
             current = following[0]
-            stop = current.type == "prismatic" or current.mimic is not None or _FINGER.search(current.name)
-            if stop or mirrored(current.name) not in robot.joints:
+            last = _FINGER.search(current.name) and len(_next(robot, current.child)) < 2  # a jaw, and no wrist
+            if current.type == "prismatic" or current.mimic or last or mirrored(current.name) not in robot.joints:
                 break
             chain.append(current.name)
         if len(chain) > len(best):

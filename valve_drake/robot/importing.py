@@ -68,12 +68,12 @@ class Report:
         }
 
 
-def import_robot(model: str, out: Path | None = None, overwrite: bool = False) -> Report:
+def import_robot(model: str, out: Path | None = None, overwrite: bool = False, picture: Path | None = None) -> Report:
     """Writes <out>/<name>.urdf, meshes/*.obj, LICENSE and robot.yaml for a URDF named by a path or a package:// URL.
 
     out: a folder, by default the robot's name. What an import has made before is made again, but for a robot.yaml,
-    which is left as it is unless `overwrite`. Raises ConfigError for what cannot be used, OperationFailed if it cannot
-    be written.
+    which is left as it is unless `overwrite`. picture: a PNG of the model, at zero. Raises ConfigError for what cannot
+    be used, OperationFailed if it cannot be written.
     """
     start = time.perf_counter()
     path = packages.resolve(model, None, "MODEL")
@@ -90,6 +90,8 @@ def import_robot(model: str, out: Path | None = None, overwrite: bool = False) -
             outputs.check(folder / each, "-o", inputs, _made_before, overwrite, new_folders=True)
 
     check(firm)  # before the long work
+    if picture is not None:
+        outputs.check(picture, "--picture", [*inputs, *(folder / each for each in firm)], None, overwrite)
     words = [*robot.links, *(mesh.get("filename", "") for mesh in robot.element.iter("mesh"))]
     converter = _Converter(robot, path)
     converter.convert()
@@ -115,10 +117,14 @@ def import_robot(model: str, out: Path | None = None, overwrite: bool = False) -
     outputs.make_folder(folder / "meshes" if converter.files else folder)
     for key, data in products.items():
         outputs.write(folder / key, data)
+    files = [folder / key for key in products]
+    if picture is not None:
+        outputs.write(picture, _portrait(folder / f"{name}.urdf", robot, converter.boxes))
+        files.append(picture)
     return Report(
         robot=robot.name,
         urdf=folder / f"{name}.urdf",
-        files=[folder / key for key in products],
+        files=files,
         mended=mended,
         notes=notes,
         todo=[] if keep else todo,
@@ -133,6 +139,14 @@ def import_robot(model: str, out: Path | None = None, overwrite: bool = False) -
         mesh_bytes=sum(len(data) for data in converter.files.values()),
         seconds=time.perf_counter() - start,
     )
+
+
+def _portrait(path: Path, robot: Robot, boxes: dict[str, np.ndarray]) -> bytes:
+    from valve_drake.robot.portrait import portrait
+
+    poses = robot.poses({joint.name: float(np.clip(0.0, *joint.range)) for joint in robot.joints.values()})
+    corners = [drafting.corners_in(poses[link], box) for link, box in boxes.items()]
+    return portrait(path, _box(np.concatenate(corners)) if corners else np.array([[-1.0, -1, 0], [1, 1, 1]]))
 
 
 def _made_before(path: Path) -> bool:

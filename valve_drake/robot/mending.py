@@ -232,7 +232,8 @@ def _inertia(robot: Robot, name: str) -> list[str]:
     m = 0.0 if mass is None else float(mass.get("value", "0"))
     if m <= 0:
         robot.links[name].remove(inertial)
-        return [] if m == 0 and element is None else [f"{where}: its mass is {m:g}: it has no inertia either"]
+        nothing = element is None or not any(float(element.get(key, "0")) for key in _INERTIA)
+        return [] if m == 0 and nothing else [f"{where}: its mass is {m:g}: it has no inertia either"]
     if element is None:
         element = ET.SubElement(inertial, "inertia", dict.fromkeys(_INERTIA, "0"))
     xx, yy, zz, xy, xz, yz = (float(element.get(key, "0")) for key in _INERTIA)

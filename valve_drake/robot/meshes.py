@@ -6,7 +6,9 @@ listed the wrong way round are turned. Nothing is decimated.
 """
 
 import dataclasses as dc
+import io
 import logging
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,9 @@ MAX_COLORS = 8  # of a mesh that paints its corners; more are a picture, of whic
 THICKNESS = 1e-3  # that a hull of a flat mesh is given [m]
 MARK = "made by valve-drake import-robot"  # in the head of what may be made again
 SUFFIXES = (".stl", ".dae", ".glb", ".gltf", ".obj", ".ply")
+
+_INSTANCE = re.compile(rb"<instance_geometry\b[^>]*\burl=[\"']#([^\"']+)")
+_BINDING = re.compile(rb"<bind_material\b.*?</bind_material>", re.DOTALL)
 
 Rgba = tuple[float, float, float, float]
 
@@ -71,9 +76,9 @@ def read(path: Path, what: str) -> Surface:
     if suffix == ".dae":
         _refuse_entities(path, what)
     try:
-        scene = _load(trimesh, path)
+        scene, remarks = _load(trimesh, path)
         parts: list[Part] = []
-        notes: list[str] = []
+        notes: list[str] = remarks
         order = {name: k for k, name in enumerate(scene.geometry)}
         nodes = [scene.graph[node] for node in scene.graph.nodes_geometry]  # whose own names may be drawn by chance
         for X, name in sorted(nodes, key=lambda node: (order[node[1]], np.asarray(node[0]).ravel().tolist())):
@@ -97,14 +102,30 @@ def read(path: Path, what: str) -> Surface:
     return Surface(_merged(parts), list(dict.fromkeys(notes)))
 
 
-def _load(trimesh: Any, path: Path) -> Any:
+def _load(trimesh: Any, path: Path) -> tuple[Any, list[str]]:
+    """trimesh's scene, and remarks."""
     logger = logging.getLogger("trimesh")
     level = logger.level
     logger.setLevel(logging.CRITICAL)  # what it warns of shows in the result
     try:
-        return trimesh.load_scene(str(path), process=False)
+        scene = trimesh.load_scene(str(path), process=False)
+        if path.suffix.lower() != ".dae":
+            return scene, []
+        data = path.read_bytes()
+        if all(any(name.startswith(one) for name in scene.geometry) for one in _dae_instances(data)):
+            return scene, []
+        # A part whose material is broken is left out with it: so all are read without.
+        bare = _BINDING.sub(b"", data)
+        resolver = trimesh.resolvers.FilePathResolver(str(path))
+        scene = trimesh.load_scene(io.BytesIO(bare), file_type="dae", process=False, resolver=resolver)
+        return scene, ["its materials are broken: it has the colour that the URDF gives"]
     finally:
         logger.setLevel(level)
+
+
+def _dae_instances(data: bytes) -> set[str]:
+    """The geometries that a DAE places."""
+    return {name.decode("utf-8", "replace") for name in _INSTANCE.findall(data)}
 
 
 def _refuse_entities(path: Path, what: str) -> None:
