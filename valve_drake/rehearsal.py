@@ -113,6 +113,7 @@ def run_twin(
         gc.collect()
         gc.freeze()
         with goes_first(0 if lockstep else scenario.hardware.priority) as first:
+            rate.loops_first = first
             if isinstance(workers, LiveImages):
                 workers.yield_to(first)
             while not (stop() or twin.gone or (duration is not None and twin.time >= duration)):

@@ -56,6 +56,7 @@ class CameraRate:
         self.limits = limits
         self.factor = self.largest = 1  # now, and so far
         self.trouble = ""  # why no program can work with this twin now
+        self.loops_first = False  # the twin's loop goes before the machine's other programs
         self._notice = notice
         self._most = {  # a camera captures at multiples of its own period only
             camera: 2 ** math.floor(math.log2(limits.slowest / period)) for camera, period in limits.fastest.items()
@@ -93,15 +94,18 @@ class CameraRate:
             self.factor *= 2
             if self.factor > self.largest:
                 self.largest = self.factor
-                self._notice(f"the twin {words}: its cameras go down to {self._rates()}; {HELP}")
+                self._notice(f"the twin {words}: its cameras go down to {self._rates()}; {self._help()}")
         elif lost > BEHIND and not self._told_floor:
             self._told_floor = True
-            self._notice(f"the twin {words} with its cameras at the floor, {self._rates()}: it goes on, slower; {HELP}")
+            self._notice(
+                f"the twin {words} with its cameras at the floor, {self._rates()}: it goes on, slower; {self._help()}"
+            )
+
+    def _help(self) -> str:
+        allowed = "" if self.loops_first else ", or leave to go before them (docs/hardware.md)"
+        return f"fewer programs beside it, or --set simulation.camera.supersample=1{allowed}, would help"
 
     def _rates(self) -> str:
         """For people."""
         rates = sorted({1 / self.period(camera) for camera in CAMERAS})
         return " and ".join(f"{rate:.3g}" for rate in rates) + " Hz"
-
-
-HELP = "fewer programs beside it, or --set simulation.camera.supersample=1, would help"
