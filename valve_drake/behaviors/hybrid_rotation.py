@@ -23,6 +23,7 @@ All vectors are in the chest frame H, which stands still while the hands are on 
 
 import copy
 import dataclasses as dc
+import math
 
 import numpy as np
 
@@ -144,15 +145,17 @@ class Chain:
 
 def make_chain(p: np.ndarray, wrenches: np.ndarray, u: np.ndarray) -> Chain:
     """p (2, 3), wrenches at the grip points (2, 6), axis u -> Chain."""
-    c = p.mean(axis=0)
+    c = (p[0] + p[1]) / 2
     line = p[1] - p[0]
     line = line - u * (u @ line)
-    L = float(np.linalg.norm(line))
+    L = math.sqrt(line @ line)
     b = line / L
     m, f = wrenches[:, :3], wrenches[:, 3:]
-    h = np.hstack([m + [cross(p[k] - c, f[k]) for k in range(2)], f])
+    h = wrenches.copy()
+    for k in range(2):
+        h[k, :3] += cross(p[k] - c, f[k])
     couples = -(h[:, :3] @ u)
-    return Chain(p, f, m, c, u, b, cross(u, b), L, h, couples, float(couples.sum()))
+    return Chain(p, f, m, c, u, b, cross(u, b), L, h, couples, float(couples[0] + couples[1]))
 
 
 def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, extra: np.ndarray) -> np.ndarray:
@@ -162,14 +165,14 @@ def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, 
     extra: added to the common twist (6,), e.g. a tug.
     """
     h1, h2 = chain.h
-    D = np.concatenate([np.full(3, config.angular_damping), np.full(3, config.damping)])
+    D = np.array([config.angular_damping] * 3 + [config.damping] * 3)
     h_a, h_r = h1 + h2, (h2 - h1) / 2
     V_a = h_a / (2 * D)
     target = np.zeros(6)
     if turn_rate is not None:
         V_a[:3] += chain.u * (turn_rate - chain.u @ V_a[:3])
         # Beyond the limit the target is constant, or the relative loop would build up force on a stuck valve.
-        couple = float(np.clip(chain.torque, -config.torque_limit, config.torque_limit))
+        couple = min(max(chain.torque, -config.torque_limit), config.torque_limit)
         target[3:] = config.squeeze * chain.b - (couple / chain.L) * chain.t
     V_a = V_a + extra
     V_r = (h_r - target) / (D / 2)
@@ -185,11 +188,11 @@ def turn_rate(left: float, rate: float, torque: float, lead: float, config: Hybr
     if torque > config.torque_limit:
         return (config.torque_limit - torque) / (2 * config.angular_damping)
     acceleration = config.rate / config.ramp
-    brake = np.sqrt(2 * acceleration * max(left, 0.0))
+    brake = math.sqrt(2 * acceleration * max(left, 0.0))
     wanted = max(config.slow, min(config.rate, brake)) if left > 0 else 0.0
     by_torque = (config.torque_limit - torque) / (0.3 * config.torque_limit)
     by_lead = (config.lead_limit - lead) / (0.25 * config.lead_limit)
-    scaled = wanted * float(np.clip(min(by_torque, by_lead), 0.0, 1.0))
+    scaled = wanted * min(max(min(by_torque, by_lead), 0.0), 1.0)
     return min(scaled, max(rate, 0.0) + acceleration * dt)
 
 
@@ -262,7 +265,7 @@ class HybridRotation:
         chain = make_chain(p, m.wrenches, u)
         if mode.activation != m.activation:
             m = self._begin(time, m, mode, X, q, chain)
-        sound = bool(np.all(np.isfinite(chain.h)))
+        sound = bool(np.isfinite(chain.h).all())
         if sound:
             m = self._angle(m, chain)
         elif mode.mode != Mode.RELEASE and m.status.state == "running":
@@ -280,8 +283,8 @@ class HybridRotation:
         """Tares the sensors while the hands stand still at the stand-off; elsewhere filters the contact wrenches."""
         raw = (state.left_wrench, state.right_wrench)
         if mode.mode == Mode.REACH:
-            still = max(np.max(np.abs(state.left_arm_velocity)), np.max(np.abs(state.right_arm_velocity))) < 0.02
-            if not still or not np.all(np.isfinite(raw)):
+            speeds = (*state.left_arm_velocity.tolist(), *state.right_arm_velocity.tolist())
+            if not all(abs(speed) < 0.02 for speed in speeds) or not np.isfinite(raw).all():
                 return changed(m, tared=False) if m.tared else m
             load = np.array([raw[k] - gravity_wrench(X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)])
             a = 1 - np.exp(-dt / self.config.tare_time)
@@ -361,11 +364,9 @@ class HybridRotation:
     def _held(self, state: RobotState) -> bool:
         """Both grippers stopped at the handle's width and press."""
         c = self.config
-        openings = np.array([state.left_gripper, state.right_gripper])
-        forces = np.array([state.left_gripper_force, state.right_gripper_force])
-        return bool(
-            np.all(np.abs(openings - self.marker.handle_width) < c.grip_margin) and np.all(forces > 0.5 * c.grip_force)
-        )
+        off = (abs(opening - self.marker.handle_width) for opening in (state.left_gripper, state.right_gripper))
+        forces = (state.left_gripper_force, state.right_gripper_force)
+        return all(o < c.grip_margin for o in off) and all(force > 0.5 * c.grip_force for force in forces)
 
     def _openings(self, state: RobotState) -> str:
         return (
@@ -396,7 +397,7 @@ class HybridRotation:
         lead = sense * (m.commanded - m.turned)
         rate = turn_rate(left, m.rate, sense * chain.torque, lead, c, dt)
         m = changed(m, rate=rate, commanded=m.commanded + sense * rate * dt)
-        progress = float(np.clip(m.turned / mode.turn_angle, 0, 1))
+        progress = min(max(m.turned / mode.turn_angle, 0.0), 1.0)
         m = changed(m, status=Status(time, m.activation, "running", progress=progress, value=m.turned))
         m = self._stall(time, m, sense, left)
         return m, twists(chain, sense * rate, c, np.zeros(6)), gripper
@@ -433,13 +434,13 @@ class HybridRotation:
     def _watch(self, time: float, dt: float, m: Memory, state: RobotState, chain: Chain) -> Memory:
         """Force trip, grasp lost, one hand carrying all, end of reach."""
         c = self.config
-        force = np.linalg.norm(chain.f, axis=1)
-        m = changed(m, tripped=m.tripped + 1 if np.max(force) > c.force_trip else 0)
+        force = [math.hypot(*f) for f in chain.f.tolist()]
+        m = changed(m, tripped=m.tripped + 1 if max(force) > c.force_trip else 0)
         if m.tripped >= 3:
             verdict = Verdict.STUCK if abs(chain.torque) > 0.7 * c.torque_limit else Verdict.FAULT
             return self._fail(time, m, verdict, f"hand forces {force[0]:.0f} and {force[1]:.0f} N")
-        openings = np.array([state.left_gripper, state.right_gripper])
-        off = np.max(np.abs(openings - self.marker.handle_width)) > 2 * c.grip_margin
+        openings = (state.left_gripper, state.right_gripper)
+        off = any(abs(opening - self.marker.handle_width) > 2 * c.grip_margin for opening in openings)
         share = chain.couples[0] / chain.torque if abs(chain.torque) > 2.0 else 0.5
         bad = off or not 0.1 < share < 0.9
         m = changed(m, bad_grip_time=m.bad_grip_time + dt if bad else 0.0)
@@ -514,7 +515,7 @@ class HybridRotation:
             force_right=chain.f[1],
             moment_left=chain.m[0],
             moment_right=chain.m[1],
-            stem_force=chain.f.sum(axis=0),
+            stem_force=chain.f[0] + chain.f[1],
             squeeze=float((chain.f[1] - chain.f[0]) @ chain.b / 2),
             center=chain.c + np.array([0, 0, self.geometry.shoulder_height]),
         )
