@@ -14,7 +14,8 @@ from valve_drake.camera.lens import load_head
 from valve_drake.frames import make
 from valve_drake.recording.reader import LogReader
 from valve_drake.stations.camera_rig import CameraRig
-from valve_drake.stations.simulated import BASE, TORSO, arm_joints, make_mounts
+from valve_drake.stations.scene import BASE, TORSO, arm_joints
+from valve_drake.stations.simulated import make_mounts
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from valve_drake.frames import apply, compose, inverse, make, planar
 from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import SIDES
 from valve_drake.stations import camera_rig, contract, simulated
-from valve_drake.stations.scene import panel_pose, start_pose
+from valve_drake.stations.scene import arm_joints, panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, StartConfig, ValveConfig
 
 PERFECT = [
@@ -117,9 +117,9 @@ def test_arms_follow_positions_and_report_torque():
 
 def true_arm(rig, side):
     """Joint angles of an arm in the plant, as no controller knows them."""
-    plant = rig.station.GetSubsystemByName("plant")
-    inner = plant.GetMyContextFromRoot(rig.context)
-    return np.array([plant.GetJointByName(name).get_angle(inner) for name in simulated.arm_joints(side)])
+    physics = rig.station.GetSubsystemByName("plant")
+    inner = physics.plant_context(rig.context)
+    return np.array([physics.plant.GetJointByName(name).get_angle(inner) for name in arm_joints(side)])
 
 
 def test_an_arm_with_a_wrong_zero_goes_to_where_its_encoders_read_the_command():
@@ -273,3 +273,91 @@ def test_an_image_is_there_when_its_latency_has_passed_and_not_before(latency):
         header = rig.header("head_left")
         assert header.sequence == max(arrived, -1)
         assert header.time == max(arrived, -1) * 0.125 or header.sequence == -1
+
+
+# ------------------------------------------------------------ the plant
+PLANT = {  # the robot drives into the panel, hands closing: impact, friction, servos at work
+    "left_gripper.position_command": np.array([-0.02]),
+    "right_gripper.position_command": np.array([-0.02]),
+    "base.twist_command": np.array([1.0, 0.0]),
+}
+
+
+def state_of(station, context):
+    """All that the plant keeps, as bytes."""
+    inner = station.GetSubsystemByName("plant").GetMyContextFromRoot(context)
+    values = inner.get_discrete_state()
+    assert inner.num_abstract_states() == inner.num_continuous_states() == 0
+    return b"".join(values.value(k).tobytes() for k in range(values.num_groups()))
+
+
+def moved(station, context, arm, until):
+    """Advances a Context in a Simulator of its own, with the left arm commanded to `arm` -> its state."""
+    station.GetInputPort("left_arm.position_command").FixValue(context, arm)
+    simulator = Simulator(station, context)
+    simulator.Initialize()
+    simulator.AdvanceTo(until)
+    return state_of(station, context)
+
+
+@pytest.fixture(scope="module")
+def pressing():
+    """Shortly after the hands have met the panel."""
+    return Rig(**PLANT).run(0.625)
+
+
+def test_the_plant_is_found_in_the_station_and_answers_in_a_context_of_the_present_state(pressing):
+    physics = pressing.station.GetSubsystemByName("plant")
+    context = physics.plant_context(pressing.context)
+    plant = physics.plant
+    assert context.get_time() == 0.625
+    base = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName("base", physics.robot))
+    np.testing.assert_allclose(base.translation()[:2], pressing.read("truth.base_pose")[:2], atol=1e-12)
+    contacts = plant.get_contact_results_output_port().Eval(context)
+    assert contacts.num_point_pair_contacts() >= 2
+    forces = [contacts.point_pair_contact_info(k).contact_force() for k in range(contacts.num_point_pair_contacts())]
+    assert np.linalg.norm(np.sum(forces, axis=0)) > 100  # the commands are in the Context, too
+    before = state_of(pressing.station, pressing.context)
+    plant.SetPositions(context, np.zeros(plant.num_positions()))
+    assert state_of(pressing.station, pressing.context) == before
+
+
+def test_a_clone_of_a_context_advances_to_the_same_bits_whatever_the_other_does(pressing):
+    station = pressing.station
+    home = initial_commands(pressing.scenario)["left_arm.position_command"]
+    clones = [pressing.context.Clone() for _ in range(3)]
+    first = moved(station, clones[0], home, 0.75)
+    other = moved(station, clones[1], home + 0.05, 0.75)  # leaves the inner diagram somewhere else
+    again = moved(station, clones[2], home, 0.75)
+    assert first == again != other
+
+
+def test_two_contexts_advanced_in_turns_do_as_they_do_alone(pressing):
+    station = pressing.station
+    home = initial_commands(pressing.scenario)["left_arm.position_command"]
+    arms = (home, home + 0.05)
+    alone = [moved(station, pressing.context.Clone(), arm, 0.75) for arm in arms]
+    contexts = [pressing.context.Clone() for _ in arms]
+    for tick in range(81, 97):
+        turns = [moved(station, context, arm, tick / 128) for context, arm in zip(contexts, arms)]
+    assert turns == alone
+
+
+def test_a_state_that_is_put_back_goes_on_to_the_same_bits(pressing):
+    station, context = pressing.station, pressing.context.Clone()
+    home = initial_commands(pressing.scenario)["left_arm.position_command"]
+    saved = context.Clone()
+    first = moved(station, context, home, 0.75)
+    context.SetTimeStateAndParametersFrom(saved)
+    assert moved(station, context, home, 0.75) == first
+
+
+def test_a_new_station_goes_on_from_another_ones_context(pressing):
+    """Nothing of the plant is in the system itself."""
+    home = initial_commands(pressing.scenario)["left_arm.position_command"]
+    station = make_station(pressing.scenario)
+    context = station.CreateDefaultContext()
+    context.SetTimeStateAndParametersFrom(pressing.context)
+    for name, value in (initial_commands(pressing.scenario) | PLANT).items():
+        station.GetInputPort(name).FixValue(context, value)
+    assert moved(station, context, home, 0.75) == moved(pressing.station, pressing.context.Clone(), home, 0.75)

@@ -20,13 +20,14 @@ after one tick and no two blocks that feed each other run at the same instant:
 
     slot 0  robot_state (measurements are gathered)
     slot 1  behaviours
-    slot 2  command_selector
+    slot 2  command_selector; the simulated plant, by the commands of the tick before
     slot 3  supervisor, perception, and the station's wrench sensors, all for the next tick
 
 Commands are published when slot 3 begins. Slow work (perception, and stance planning: `later`) therefore runs in
 slot 3 and cannot delay them.
 
-Every block uses UNRESTRICTED updates: a discrete update would see the plant already stepped.
+Every block uses UNRESTRICTED updates: Drake makes them all from the state before any of them. A discrete update, made
+afterwards, would see what the other blocks have made of the same instant.
 """
 
 import functools

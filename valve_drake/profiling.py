@@ -30,7 +30,7 @@ class Spent:
     imports: float  # of the process, before the run: interpreter, imports, reading the scenario
     start_up: float  # until the first step, without the renderers'
     renderers_start_up: float  # until they could make images
-    plant: float | None  # None where Drake advances it among its other events: `framework` holds it then
+    plant: float | None  # None where there is none: station `hardware`
     framework: float  # Drake's events, state copies and ports
     stages: dict[str, float]  # by block, the station's too
     images: float  # fetching and decoding them
@@ -46,7 +46,6 @@ class Spent:
         parts["stages"] = sum(self.stages.values())
         if self.plant is None:
             del parts["plant"]
-            parts["plant and framework"] = parts.pop("framework")
         return {name.replace("_", " "): seconds for name, seconds in parts.items()}
 
     @property

@@ -20,8 +20,8 @@ from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.perception.handle_marker import find_mark
 from valve_drake.scenario import Scenario, resolve
 from valve_drake.stations.camera_rig import CameraRig, Capture
-from valve_drake.stations.scene import panel_pose, start_pose
-from valve_drake.stations.simulated import BASE, arm_joints, make_mounts
+from valve_drake.stations.scene import BASE, arm_joints, panel_pose, start_pose
+from valve_drake.stations.simulated import make_mounts
 from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
 
 PROBE = 0.02  # of the hand to both sides along each of its axes [m]

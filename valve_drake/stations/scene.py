@@ -1,5 +1,5 @@
-"""The simulated world as one MultibodyPlant: robot, valve, laboratory. Used twice by the simulated station, once with
-physics and once for the cameras to render, and by pictures in the documents."""
+"""The simulated world as one MultibodyPlant: robot, valve, laboratory. Used by the simulated station, once with
+physics and once each for the cameras and the 3D view, and by pictures in the documents."""
 
 import dataclasses as dc
 import functools
@@ -17,6 +17,8 @@ from valve_drake import resources
 from valve_drake.frames import make, rot_y, rot_z
 from valve_drake.stations.simulation_config import StartConfig, ValveConfig
 
+TORSO = ("waist", "neck_pitch", "neck_yaw")  # joints of the robot's model, in the order of the contract
+BASE = ("base_x", "base_y", "base_yaw")
 MARKER_RED = (0.80, 0.06, 0.05, 1.0)
 MARKER_THICKNESS = 1e-5  # a sticker: a plate would show its rim to a camera from above [m]
 SEIZED = 1e4  # friction of a valve that does not turn [N m]
@@ -28,6 +30,11 @@ class Scene:
 
     robot: ModelInstanceIndex
     valve: ModelInstanceIndex
+
+
+def arm_joints(side: str) -> list[str]:
+    """The arm's joints in the robot's model, from the shoulder on."""
+    return [f"{side}_arm_{k}" for k in range(1, 7)]
 
 
 def parse(plant: MultibodyPlant, model: str) -> ModelInstanceIndex:

@@ -1,88 +1,29 @@
 """The simulated station: contact physics, joint servos, sensors and cameras behind the contract's ports.
 
-Nothing is welded or moved by hand: the fingers hold the handles by friction and the valve turns by the hands' forces.
-Joints are implicit PD servos with effort limits that get positions at 1/128 s, and gravity is fed forward from a model
-of the robot alone. `truth.*` ports exist here only; the recorder alone reads them.
+Nothing is welded or moved by hand: the fingers hold the handles by friction and the valve turns by the hands' forces
+(plant_system.py). `truth.*` ports exist here only; the recorder alone reads them.
 """
 
-import dataclasses as dc
-import math
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
-from pydrake.common.value import Value
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
-from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.systems.controllers import InverseDynamics
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
-from pydrake.systems.primitives import AffineSystem, ConstantVectorSource, MatrixGain, Multiplexer
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.primitives import AffineSystem, MatrixGain
+from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
 from valve_drake.messages import DEVICES, SIDES, Health
-from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs
+from valve_drake.ports import TICK, Block, Inputs, Outputs
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
-from valve_drake.stations.contract import CAMERAS, CONTRACT, TRUTH, check_contract
-from valve_drake.stations.scene import Scene, add_scene, panel_pose, parse, start_pose
+from valve_drake.stations.contract import CAMERAS, TRUTH, check_contract
+from valve_drake.stations.plant_system import COMMANDS, PlantSystem
+from valve_drake.stations.scene import BASE, TORSO, add_scene, arm_joints, panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig, ValveConfig
-
-TORSO = ("waist", "neck_pitch", "neck_yaw")
-BASE = ("base_x", "base_y", "base_yaw")
-STEP = 2 * SLOT  # of the plant [s]; halving it leaves forces and angles as they are and doubles the work
-FINGER_STIFFNESS = 2e4  # of the finger servo, as in the model file [N/m]
-
-
-def arm_joints(side: str) -> list[str]:
-    return [f"{side}_arm_{k}" for k in range(1, 7)]
-
-
-class ServoDriver(LeafSystem):
-    """Computes the set points of the base and of the fingers, which change at every step of the plant.
-
-    The base's is the integral of its twist. A finger's is clipped about the measured position, so that the servo's
-    stiffness times the difference never exceeds the gripper's force limit.
-    Output (10,): q_d of base x, y, heading, left and right finger, then their v_d.
-    """
-
-    def __init__(self, fingers: list[int], states: int, start: np.ndarray):
-        super().__init__()
-        self.set_name("servo_driver")
-        self._fingers = fingers
-        self._twist = self.DeclareVectorInputPort("base.twist_command", 2)
-        self._opening = [self.DeclareVectorInputPort(f"{side}_gripper.position_command", 1) for side in SIDES]
-        self._limit = [self.DeclareVectorInputPort(f"{side}_gripper.force_limit", 1) for side in SIDES]
-        self._state = self.DeclareVectorInputPort("plant_state", states)
-        self._pose = self.DeclareDiscreteState(6)  # base set point x, y, heading; its time; forward, yaw rate
-        self._start = start
-        self.DeclareInitializationDiscreteUpdateEvent(self._begin)
-        self.DeclarePeriodicDiscreteUpdateEvent(TICK, 3 * SLOT, self._integrate)
-        self.DeclareVectorOutputPort("desired", 10, self._calc)
-
-    def _begin(self, context: Context, state: DiscreteValues) -> None:
-        state.set_value(int(self._pose), np.concatenate([self._start, np.zeros(3)]))
-
-    def _now(self, context: Context) -> tuple[float, float, float, float, float]:
-        """Base set point x, y, heading, and the twist that moves it."""
-        x, y, h, t0, v, w = context.get_discrete_state(int(self._pose)).value()
-        dt = context.get_time() - t0
-        middle = h + w * dt / 2
-        return x + v * dt * math.cos(middle), y + v * dt * math.sin(middle), h + w * dt, v, w
-
-    def _integrate(self, context: Context, state: DiscreteValues) -> None:
-        pose = self._now(context)[:3]
-        state.set_value(int(self._pose), [*pose, context.get_time(), *self._twist.Eval(context)])
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        x, y, h, v, w = self._now(context)
-        state = self._state.Eval(context)
-        fingers = []
-        for k, slot in enumerate(self._fingers):
-            q = state[slot]
-            reach = self._limit[k].Eval(context)[0] / FINGER_STIFFNESS
-            fingers.append(q + min(max(self._opening[k].Eval(context)[0] / 2 - q, -reach), reach))
-        output.SetFromVector([x, y, h, *fingers, v * math.cos(h), v * math.sin(h), w, 0.0, 0.0])
 
 
 def _affine(gain: np.ndarray, offset: np.ndarray) -> AffineSystem:
@@ -95,52 +36,6 @@ def arm_offsets(error: ErrorConfig, seed: int) -> dict[str, np.ndarray]:
     """What each arm's encoders read at the joints' true zero: side -> (6,) [rad]."""
     draw = _rng(seed, 5).standard_normal((2, 6))
     return {side: error.arm_offset * draw[k] for k, side in enumerate(SIDES)}
-
-
-def _add_servos(
-    builder: DiagramBuilder, plant: MultibodyPlant, scene: Scene, start: np.ndarray, offsets: dict[str, np.ndarray]
-) -> ServoDriver:
-    """From the contract's commands to [q_d; v_d] of all actuators. Arms and torso get v_d = 0: they are sent positions.
-
-    offsets: of `arm_offsets`; an arm goes to where its encoders read the command. All but the base and the fingers is
-    C++, as it runs at every step of the plant.
-    """
-    actuated = [plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices(scene.robot)]
-    n = len(actuated)
-    fingers = [f"{side}_finger_1" for side in SIDES]
-    driver = builder.AddSystem(
-        ServoDriver(
-            [plant.GetJointByName(f, scene.robot).position_start() for f in fingers],
-            plant.num_multibody_states(),
-            start,
-        )
-    )
-    arms = {f"{side}_arm.position_command": arm_joints(side) for side in SIDES}
-    parts = {"torso.position_command": list(TORSO), **arms}
-    joints = [joint for names in parts.values() for joint in names]
-    every = Multiplexer([*(len(names) for names in parts.values()), 10])
-    every.set_name("servo_targets")
-    builder.AddSystem(every)
-    order = np.zeros((2 * n, every.get_output_port().size()))
-    for k, joint in enumerate(joints):
-        order[actuated.index(joint), k] = 1
-    for k, joint in enumerate([*BASE, *fingers]):
-        order[actuated.index(joint), len(joints) + k] = 1
-        order[n + actuated.index(joint), len(joints) + 5 + k] = 1
-    zeros = np.zeros(order.shape[1])
-    zeros[: len(joints)] = np.concatenate([np.zeros(len(TORSO)), *(offsets[side] for side in SIDES)])
-    sort = builder.AddSystem(_affine(order, -order @ zeros))
-    sort.set_name("servo_order")
-    for k, port in enumerate(parts):
-        builder.ExportInput(every.get_input_port(k), port)
-    builder.Connect(driver.get_output_port(), every.get_input_port(len(parts)))
-    builder.Connect(every.get_output_port(), sort.get_input_port())
-    for spec in CONTRACT:
-        if spec.direction == "in" and spec.name not in parts:
-            builder.ExportInput(driver.GetInputPort(spec.name), spec.name)
-    builder.Connect(plant.get_state_output_port(), driver.GetInputPort("plant_state"))
-    builder.Connect(sort.get_output_port(), plant.get_desired_state_input_port(scene.robot))
-    return driver
 
 
 def _rng(seed: int, stream: int) -> np.random.Generator:
@@ -197,23 +92,19 @@ class OdometrySystem(Block[OdometryInputs, tuple[np.ndarray, int]]):
         return (new, count + 1), {"odometry": new}
 
 
-class WrenchSensorInputs(Inputs):
-    reaction_forces: Annotated[list[SpatialForce], Value[list[SpatialForce]]()]
-
-
-class WrenchSensorSystem(Block[WrenchSensorInputs, int]):
+class WrenchSensorSystem(Block[Inputs, int]):
     """Both wrist force-torque sensors: load felt by the sensor, in its frame, with bias and noise.
 
-    port             dir  type                notes
-    ---------------  ---  ------------------  -------------------------------------
-    reaction_forces  in   list[SpatialForce]  of the plant, by joint
-    left, right      out  vector(6)           [torque; force] [N m, N]
+    port                    dir  type       notes
+    ----------------------  ---  ---------  --------------------------------------------------------
+    left_load, right_load   in   vector(6)  on the hand, from the arm, [torque; force] [N m, N]
+    left, right             out  vector(6)  what the sensor feels, the opposite [torque; force] [N m, N]
     """
 
+    INPUTS = {f"{side}_load": 6 for side in SIDES}
     OUTPUTS = {side: 6 for side in SIDES}
 
-    def __init__(self, joints: dict[str, int], error: ErrorConfig, seed: int):
-        self._joints = joints
+    def __init__(self, error: ErrorConfig, seed: int):
         self._noise = _Noise(seed, 3, 12)
         torque, force = np.ones(3), np.ones(3)
         self._scatter = np.concatenate([error.wrench_noise_torque * torque, error.wrench_noise_force * force])
@@ -225,14 +116,11 @@ class WrenchSensorSystem(Block[WrenchSensorInputs, int]):
     def initial(self) -> int:
         return 0
 
-    def step(self, time: float, inputs: WrenchSensorInputs, memory: int) -> tuple[int, Outputs]:
-        forces = inputs.reaction_forces
+    def step(self, time: float, inputs: Inputs, memory: int) -> tuple[int, Outputs]:
         draw = self._noise(memory).reshape(2, 6)
         out = {}
         for k, side in enumerate(SIDES):
-            F = forces[self._joints[side]]  # on the hand, from the arm; the sensor feels the opposite
-            felt = -np.concatenate([F.rotational(), F.translational()])
-            out[side] = felt + self._bias[side] + self._scatter * draw[k]
+            out[side] = -inputs[f"{side}_load"] + self._bias[side] + self._scatter * draw[k]
         return memory + 1, out
 
 
@@ -252,33 +140,33 @@ class HealthSystem(Block[Inputs, None]):
 class TruthSystem(LeafSystem):
     """What only a simulation knows, for the recorder and the metrics; the state is that of the instant it is read.
 
-    port             dir  type                notes
-    ---------------  ---  ------------------  ------------------------------------------------------
-    state            in   vector              of the whole plant
-    reaction_forces  in   list[SpatialForce]  of the plant's last step
-    valve_angle      out  vector(2)           opened since closed [rad], and its rate [rad/s]
-    base_pose        out  vector(3)           x, y, heading in W
-    marker_pose      out  vector(12)          X_WV, rows of (3, 4)
-    stem_wrench      out  vector(6)           on the valve from its bearing, in the stem's frame
+    port         dir  type        notes
+    -----------  ---  ----------  ---------------------------------------------------------------------
+    state        in   vector      of the whole plant
+    stem_load    in   vector(6)   of the plant
+    valve_angle  out  vector(2)   opened since closed [rad], and its rate [rad/s]
+    base_pose    out  vector(3)   x, y, heading in W
+    marker_pose  out  vector(12)  X_WV, rows of (3, 4)
+    stem_wrench  out  vector(6)   on the valve from its bearing, in the stem's frame, in the last step
     """
 
     OUTPUTS = {"valve_angle": 2, "base_pose": 3, "marker_pose": 12, "stem_wrench": 6}
 
-    def __init__(self, plant: MultibodyPlant, scene: Scene, valve: ValveConfig):
+    def __init__(self, physics: PlantSystem, valve: ValveConfig):
         super().__init__()
         self.set_name("truth")
+        plant = physics.plant
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
-        self._forces = self.DeclareAbstractInputPort("reaction_forces", Value[list[SpatialForce]]())
-        stem = plant.GetJointByName("stem", scene.valve)
-        self._stem = int(stem.index())
+        self._load = self.DeclareVectorInputPort("stem_load", 6)
+        stem = plant.GetJointByName("stem", physics.valve)
         self._q, self._v = stem.position_start(), plant.num_positions() + stem.velocity_start()
-        self._base = [plant.GetJointByName(j, scene.robot).position_start() for j in BASE]
+        self._base = [plant.GetJointByName(j, physics.robot).position_start() for j in BASE]
         self._bar_angle = valve.bar_angle
         self._X_WP = panel_pose(valve)
-        X = plant.GetFrameByName("marker", scene.valve).GetFixedPoseInBodyFrame()
+        X = plant.GetFrameByName("marker", physics.valve).GetFixedPoseInBodyFrame()
         self._X_LinkMarker = make(X.rotation().matrix(), X.translation())
         for name, size in self.OUTPUTS.items():
-            source = self._forces if name == "stem_wrench" else self._state
+            source = self._load if name == "stem_wrench" else self._state
             calc = getattr(self, f"_calc_{name}")
             self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc={source.ticket()})
 
@@ -294,10 +182,7 @@ class TruthSystem(LeafSystem):
         output.SetFromVector(compose(self._X_WP, turn, self._X_LinkMarker).ravel())
 
     def _calc_stem_wrench(self, context: Context, output: BasicVector) -> None:
-        forces = self._forces.Eval(context)
-        if len(forces) > self._stem:  # none before the first step
-            F = forces[self._stem]
-            output.SetFromVector(np.concatenate([F.rotational(), F.translational()]))
+        output.SetFromVector(self._load.Eval(context))
 
 
 def true_head(head: StereoHead, error: ErrorConfig, seed: int) -> dict[str, Mount]:
@@ -336,31 +221,22 @@ def rig_arguments(
     return mounts, simulation.valve, marker_size, simulation.light, simulation.camera, seed
 
 
-@dc.dataclass(frozen=True)
-class Joints:
-    """Indices of joints in the plant's state and actuation."""
-
-    plant: MultibodyPlant
-    scene: Scene
-
-    def select(self, names: list[str], what: str) -> np.ndarray:
-        """0/1 matrix that picks these joints out of state ("position", "velocity") or net actuation ("torque")."""
-        if what == "torque":
-            order = [
-                self.plant.get_joint_actuator(i).joint().name()
-                for i in self.plant.GetJointActuatorIndices(self.scene.robot)
-            ]
-            columns, width = [order.index(n) for n in names], len(order)
+def _select(physics: PlantSystem, joints: Sequence[str], what: str) -> np.ndarray:
+    """0/1 matrix that picks these joints of the robot out of the plant's state ("position", "velocity") or actuation
+    ("torque")."""
+    plant = physics.plant
+    if what == "torque":
+        columns, width = [physics.actuated.index(name) for name in joints], len(physics.actuated)
+    else:
+        found = [plant.GetJointByName(name, physics.robot) for name in joints]
+        width = plant.num_multibody_states()
+        if what == "position":
+            columns = [joint.position_start() for joint in found]
         else:
-            joints = [self.plant.GetJointByName(n, self.scene.robot) for n in names]
-            width = self.plant.num_multibody_states()
-            if what == "position":
-                columns = [j.position_start() for j in joints]
-            else:
-                columns = [self.plant.num_positions() + j.velocity_start() for j in joints]
-        D = np.zeros((len(names), width))
-        D[range(len(names)), columns] = 1
-        return D
+            columns = [plant.num_positions() + joint.velocity_start() for joint in found]
+    picked = np.zeros((len(joints), width))
+    picked[range(len(joints)), columns] = 1
+    return picked
 
 
 def make_simulated_station(
@@ -378,50 +254,27 @@ def make_simulated_station(
     workers: of `rig_arguments`, make the images; else they are made when they are read.
     """
     builder = DiagramBuilder()
-    config = MultibodyPlantConfig(
-        time_step=STEP, discrete_contact_approximation="lagged", contact_model="point", stiction_tolerance=1e-4
-    )
-    plant, scene_graph = AddMultibodyPlant(config, builder)
-    plant.set_name("plant")
-    scene_graph.set_name("scene_graph")
     valve = simulation.valve
-    scene = add_scene(plant, valve, marker_size)
-    plant.Finalize()
-    if meshcat is None:
-        _leave_out_looks(plant, scene_graph)
-    start = start_pose(simulation.start, valve)
     offsets = arm_offsets(simulation.error, seed)
-    arms = home - np.concatenate([offsets[side] for side in SIDES])  # home is what the encoders read
-    _set_start(plant, scene, simulation, start, arms, opening)
-    joints = Joints(plant, scene)
+    start = dict(zip(BASE, start_pose(simulation.start, valve)))
+    for k, side in enumerate(SIDES):
+        start |= dict(zip(arm_joints(side), home[6 * k : 6 * k + 6] - offsets[side]))  # home is what the encoders read
+        start |= {f"{side}_finger_{finger}": opening / 2 for finger in (1, 2)}
+    physics = builder.AddSystem(PlantSystem(valve, marker_size, start, offsets))
+    state, plant = physics.GetOutputPort("state"), physics.plant
+    for name in COMMANDS:
+        builder.ExportInput(physics.GetInputPort(name), name)
 
-    driver = _add_servos(builder, plant, scene, start, offsets)
-    still = builder.AddSystem(ConstantVectorSource(np.zeros(2)))
-    still.set_name("valve_at_rest")
-    builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(scene.valve))
-
-    model = MultibodyPlant(STEP)
-    parse(model, "robot")
-    model.Finalize()
-    gravity = builder.AddSystem(InverseDynamics(model, InverseDynamics.InverseDynamicsMode.kGravityCompensation))
-    gravity.set_name("gravity_compensation")
-    driver.keep_alive = model  # InverseDynamics refers to it; a Python block lives as long as the diagram
-    builder.Connect(plant.get_state_output_port(scene.robot), gravity.get_input_port_estimated_state())
-    actuation = builder.AddSystem(MatrixGain(model.MakeActuationMatrix().T))
-    actuation.set_name("gravity_torques")
-    builder.Connect(gravity.get_output_port_generalized_force(), actuation.get_input_port())
-    builder.Connect(actuation.get_output_port(), plant.get_actuation_input_port(scene.robot))
-
-    def measure(port: str, names: list[str], what: str, factor: float = 1.0, offset: np.ndarray | None = None) -> None:
-        matrix = factor * joints.select(names, what)
+    def measure(
+        port: str, joints: Sequence[str], what: str, factor: float = 1.0, offset: np.ndarray | None = None
+    ) -> None:
+        matrix = factor * _select(physics, joints, what)
         gain = builder.AddSystem(MatrixGain(matrix) if offset is None else _affine(matrix, offset))
         gain.set_name(port)
-        torque = what == "torque"
-        source = plant.get_net_actuation_output_port(scene.robot) if torque else plant.get_state_output_port()
-        builder.Connect(source, gain.get_input_port())
+        builder.Connect(physics.GetOutputPort("actuation") if what == "torque" else state, gain.get_input_port())
         builder.ExportOutput(gain.get_output_port(), port)
 
-    measure("torso.position_measured", list(TORSO), "position")
+    measure("torso.position_measured", TORSO, "position")
     for side in SIDES:
         measure(f"{side}_arm.position_measured", arm_joints(side), "position", offset=offsets[side])
         measure(f"{side}_arm.velocity_measured", arm_joints(side), "velocity")
@@ -429,26 +282,23 @@ def make_simulated_station(
         measure(f"{side}_gripper.position_measured", [f"{side}_finger_1"], "position", 2.0)
         measure(f"{side}_gripper.force_measured", [f"{side}_finger_1"], "torque", -1.0)
 
-    base = builder.AddSystem(
-        MatrixGain(np.vstack([joints.select(list(BASE), "position"), joints.select(list(BASE), "velocity")]))
-    )
+    base = builder.AddSystem(MatrixGain(np.vstack([_select(physics, BASE, what) for what in ("position", "velocity")])))
     base.set_name("base_state")
-    builder.Connect(plant.get_state_output_port(), base.get_input_port())
+    builder.Connect(state, base.get_input_port())
     odometry = builder.AddSystem(OdometrySystem(simulation.error, seed))
     builder.Connect(base.get_output_port(), odometry.GetInputPort("base"))
     builder.ExportOutput(odometry.GetOutputPort("odometry"), "base.odometry")
 
-    sensors = {side: int(plant.GetJointByName(f"{side}_wrist_sensor", scene.robot).index()) for side in SIDES}
-    wrench = builder.AddSystem(WrenchSensorSystem(sensors, simulation.error, seed))
-    builder.Connect(plant.get_reaction_forces_output_port(), wrench.GetInputPort("reaction_forces"))
+    wrench = builder.AddSystem(WrenchSensorSystem(simulation.error, seed))
     for side in SIDES:
+        builder.Connect(physics.GetOutputPort(side), wrench.GetInputPort(f"{side}_load"))
         builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
 
     camera = simulation.camera
     images = CameraRig(*rig_arguments(simulation, marker_size, head, seed)) if workers is None else workers
     positions = builder.AddSystem(MatrixGain(np.eye(plant.num_positions(), plant.num_multibody_states())))
     positions.set_name("positions")
-    builder.Connect(plant.get_state_output_port(), positions.get_input_port())
+    builder.Connect(state, positions.get_input_port())
     for name in CAMERAS:
         period = camera.head_period if name.startswith("head") else camera.wrist_period
         system = builder.AddSystem(CameraSystem(name, plant.num_positions(), period, camera.latency, images))
@@ -458,45 +308,36 @@ def make_simulated_station(
     health = builder.AddSystem(HealthSystem())
     builder.ExportOutput(health.GetOutputPort("health"), "health")
 
-    truth = builder.AddSystem(TruthSystem(plant, scene, valve))
-    builder.Connect(plant.get_state_output_port(), truth.GetInputPort("state"))
-    builder.Connect(plant.get_reaction_forces_output_port(), truth.GetInputPort("reaction_forces"))
+    truth = builder.AddSystem(TruthSystem(physics, valve))
+    builder.Connect(state, truth.GetInputPort("state"))
+    builder.Connect(physics.GetOutputPort("stem"), truth.GetInputPort("stem_load"))
     for name in TruthSystem.OUTPUTS:
         builder.ExportOutput(truth.GetOutputPort(name), TRUTH + name)
 
     if meshcat is not None:
-        params = MeshcatVisualizerParams(publish_period=1 / 16)
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, params).set_name("meshcat")
+        physics.view = _add_view(builder, positions.get_output_port(), valve, marker_size, meshcat)  # lives as long
     station = builder.Build()
     station.set_name("simulated")
     check_contract(station)
     return station
 
 
-def _leave_out_looks(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Removes the visual geometry: it would cost time at every step, and the cameras render a scene of their own."""
-    inspector = scene_graph.model_inspector()
-    source = plant.get_source_id()
-    assert source is not None
-    for id in inspector.GetAllGeometryIds():
-        if inspector.GetProximityProperties(id) is None and inspector.BelongsToSource(id, source):
-            scene_graph.RemoveGeometry(source, id)
-
-
-def _set_start(
-    plant: MultibodyPlant,
-    scene: Scene,
-    simulation: SimulationConfig,
-    start: np.ndarray,
-    arms: np.ndarray,
-    opening: float,
-) -> None:
-    """Default positions of all joints: where the run begins. arms: true angles of both (12,) [rad]."""
-    values = dict(zip(BASE, start))
-    for k, side in enumerate(SIDES):
-        values |= dict(zip(arm_joints(side), arms[6 * k : 6 * k + 6]))
-        values |= {f"{side}_finger_{finger}": opening / 2 for finger in (1, 2)}
-    for name, value in values.items():
-        plant.GetJointByName(name, scene.robot).set_default_positions([value])
-    valve = simulation.valve
-    plant.GetJointByName("stem", scene.valve).set_default_positions([valve.bar_angle + max(valve.position, 0.0)])
+def _add_view(
+    builder: DiagramBuilder,
+    positions: OutputPort,
+    valve: ValveConfig,
+    marker_size: tuple[float, float],
+    meshcat: Meshcat,
+) -> MultibodyPlant:
+    """Shows the positions in a scene of its own, with all looks -> its plant, which must outlive the diagram."""
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    plant = MultibodyPlant(0.0)
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    add_scene(plant, valve, marker_size)
+    plant.Finalize()
+    poses = builder.AddNamedSystem("poses", MultibodyPositionToGeometryPose(plant))
+    builder.Connect(positions, poses.get_input_port())
+    builder.Connect(poses.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id()))
+    params = MeshcatVisualizerParams(publish_period=1 / 16)
+    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, params).set_name("meshcat")
+    return plant

@@ -1,0 +1,237 @@
+"""System `plant` of the simulated station: robot, valve and room as a MultibodyPlant, with the joints' servos.
+
+The MultibodyPlant, its SceneGraph and all that works at each of its steps form a Diagram of their own, in C++.
+`PlantSystem` takes that diagram through one control tick at a time, so that no other system is woken at a plant's
+step. Whatever the plant keeps from one tick to the next is state of the PlantSystem; the Context of the inner diagram
+is scratch paper, written from that state before every step. A Context of the station can therefore be cloned, saved,
+restored and advanced again to the same bits.
+"""
+
+import math
+import threading
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.controllers import InverseDynamics
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    FixedInputPortValue,
+    LeafSystem,
+    State,
+)
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
+
+from valve_drake import profiling
+from valve_drake.messages import SIDES
+from valve_drake.ports import SLOT, TICK
+from valve_drake.stations.contract import CONTRACT
+from valve_drake.stations.scene import BASE, TORSO, add_scene, arm_joints, parse
+from valve_drake.stations.simulation_config import ValveConfig
+
+STEPS = 2  # of the plant in a tick; twice as many leave forces and angles as they are and double the work
+FINGER_STIFFNESS = 2e4  # of the finger servo, as in the model file [N/m]
+COMMANDS = {spec.name: spec.kind for spec in CONTRACT if spec.direction == "in" and isinstance(spec.kind, int)}
+LOADED = {**{side: f"{side}_wrist_sensor" for side in SIDES}, "stem": "stem"}  # output port -> joint
+
+
+class Stepped(NamedTuple):
+    """The plant after a tick."""
+
+    x: np.ndarray  # positions and velocities (nx,)
+    base: np.ndarray  # set point x, y, heading (3,) [m, rad]
+    actuation: np.ndarray  # of the robot's actuators during the last step (n,) [N m, N]
+    loads: list[np.ndarray]  # on the joints LOADED during the last step (6,) [N m, N]
+
+
+class PlantSystem(LeafSystem):
+    """Advances the plant once a tick, in slot 2, by the commands of the tick before.
+
+    port                             dir  type       notes
+    -------------------------------  ---  ---------  ---------------------------------------------------------------
+    (the station's inputs)           in   vector     as in stations/contract.py
+    state                            out  vector     positions and velocities of `plant`
+    actuation                        out  vector     of the robot's actuators in the last step, by index [N m, N]
+    left, right, stem                out  vector(6)  [torque; force] of the joint on its child in the last step, in
+                                                     the child's frame: the wrist sensors and the valve's stem
+
+    Slot 2 of tick k finds the commands of tick k - 1 at its ports, since command_selector replaces them at the same
+    instant, and makes the state of t_(k+1) from that of t_k. So a command of tick k moves the joints from t_(k+1) on,
+    and the ports show the state of t_(k+1) from slot 2 of tick k to slot 2 of tick k + 1. That is the present state
+    for whoever reads in slot 0 or 1 (cameras, truth, robot_state); wrist sensors and odometry read it in slot 3 for
+    robot_state to find at t_(k+1).
+
+    Servos: joints are implicit PD servos with effort limits. Arms and torso are sent positions, with v_d = 0. The
+    base's set point is the integral of its twist. A finger's is clipped about its position at each step, so that the
+    servo's stiffness times the difference never exceeds the gripper's force limit. Gravity is fed forward from a model
+    of the robot alone.
+
+    plant, scene_graph, robot, valve: the MultibodyPlant, its geometry, its model instances; `plant_context` makes a
+    Context for them. They belong to `diagram`, which nobody else advances. actuated: the robot's joints with an
+    actuator, in the order of `actuation`.
+    """
+
+    def __init__(
+        self,
+        valve: ValveConfig,
+        marker_size: tuple[float, float],
+        start: Mapping[str, float],
+        offsets: Mapping[str, np.ndarray],
+    ):
+        """start: joint of the robot -> where it is at first [m, rad]; offsets: side -> what the arm's encoders read at
+        the joints' true zero (6,) [rad]: an arm goes to where its encoders read the command."""
+        super().__init__()
+        self.set_name("plant")
+        builder = DiagramBuilder()
+        config = MultibodyPlantConfig(
+            time_step=TICK / STEPS,
+            discrete_contact_approximation="lagged",
+            contact_model="point",
+            stiction_tolerance=1e-4,
+            use_sampled_output_ports=False,  # `_advance` reads its outputs at the last step itself
+        )
+        self.plant, self.scene_graph = AddMultibodyPlant(config, builder)
+        self.plant.set_name("plant")
+        self.scene_graph.set_name("scene_graph")
+        scene = add_scene(self.plant, valve, marker_size)
+        self.robot, self.valve = scene.robot, scene.valve
+        self.plant.Finalize()
+        _leave_out_looks(self.plant, self.scene_graph)
+        for name, value in start.items():
+            self.plant.GetJointByName(name, self.robot).set_default_positions([value])
+        stem = self.plant.GetJointByName("stem", self.valve)
+        stem.set_default_positions([valve.bar_angle + max(valve.position, 0.0)])
+        self._gravity = _add_gravity(builder, self.plant, self.robot)
+        still = builder.AddNamedSystem("valve_at_rest", ConstantVectorSource(np.zeros(2)))
+        builder.Connect(still.get_output_port(), self.plant.get_desired_state_input_port(self.valve))
+        builder.ExportInput(self.plant.get_desired_state_input_port(self.robot), "desired")
+        self.diagram: Diagram = builder.Build()
+        self.diagram.set_name("plant_with_servos")
+
+        joints = [self.plant.get_joint_actuator(i).joint() for i in self.plant.GetJointActuatorIndices(self.robot)]
+        self.actuated = order = [joint.name() for joint in joints]
+        fingers = [f"{side}_finger_1" for side in SIDES]
+        self._sent = [order.index(j) for names in (TORSO, *map(arm_joints, SIDES)) for j in names]
+        self._zeros = np.concatenate([np.zeros(len(TORSO)), *(offsets[side] for side in SIDES)])
+        self._base_at = [order.index(name) for name in BASE]
+        self._fingers = [(order.index(name), joints[order.index(name)].position_start()) for name in fingers]
+
+        self._inputs = {name: self.DeclareVectorInputPort(name, size) for name, size in COMMANDS.items()}
+        self._scratch = self.diagram.CreateDefaultContext()
+        self._lock = threading.Lock()  # of the scratch: two threads may advance two Contexts
+        self._inner = self.plant.GetMyMutableContextFromRoot(self._scratch)
+        self._desired = self._fix(self._scratch, np.zeros(2 * len(self.actuated)))
+        self._loads = [self.plant.GetJointByName(name).index() for name in LOADED.values()]
+        self._x = self.DeclareDiscreteState(self.plant.GetPositionsAndVelocities(self._inner))
+        self._base = self.DeclareDiscreteState([start[name] for name in BASE])
+        self._actuation = self.DeclareDiscreteState(len(self.actuated))
+        self._load = [self.DeclareDiscreteState(6) for _ in LOADED]
+        self.DeclareStateOutputPort("state", self._x)
+        self.DeclareStateOutputPort("actuation", self._actuation)
+        for name, index in zip(LOADED, self._load):
+            self.DeclareStateOutputPort(name, index)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(TICK, 2 * SLOT, self._update)
+
+    def plant_context(self, root: Context) -> Context:
+        """A new Context of `plant` with the positions, velocities and commands that `root` holds, for any question to
+        the plant or the geometry in it; changing it changes nothing else. root: of the station, or of a diagram that
+        it is in. Outputs that depend on forces are those of the step to come.
+        """
+        context = self.GetMyContextFromRoot(root)
+        x, base = (context.get_discrete_state(index).value() for index in (self._x, self._base))
+        inner = self.diagram.CreateDefaultContext()
+        inner.SetTime(context.get_time())
+        plant_context = self.plant.GetMyMutableContextFromRoot(inner)
+        self.plant.SetPositionsAndVelocities(plant_context, x)
+        self._fix(inner, self._set_points(x, base, self._commands(context), 0.0))
+        return plant_context
+
+    def _fix(self, context: Context, desired: np.ndarray) -> FixedInputPortValue:
+        return self.diagram.GetInputPort("desired").FixValue(context, desired)
+
+    def _commands(self, context: Context) -> dict[str, np.ndarray]:
+        return {name: port.Eval(context) for name, port in self._inputs.items()}
+
+    def _set_points(self, x: np.ndarray, base: np.ndarray, commands: dict[str, np.ndarray], time: float) -> np.ndarray:
+        """[q_d; v_d] of the robot's actuators, `time` after the tick's begin; base: its set point then, x: now."""
+        n = len(self.actuated)
+        desired = np.zeros(2 * n)
+        sent = [commands["torso.position_command"], *(commands[f"{side}_arm.position_command"] for side in SIDES)]
+        desired[self._sent] = np.concatenate(sent) - self._zeros
+        forward, yaw_rate = commands["base.twist_command"]
+        pose = _driven(base, forward, yaw_rate, time)
+        speed = (forward * math.cos(pose[2]), forward * math.sin(pose[2]), yaw_rate)
+        for k, at in enumerate(self._base_at):
+            desired[at], desired[n + at] = pose[k], speed[k]
+        for side, (at, position) in zip(SIDES, self._fingers):
+            q = x[position]
+            reach = commands[f"{side}_gripper.force_limit"][0] / FINGER_STIFFNESS
+            opening = commands[f"{side}_gripper.position_command"][0]
+            desired[at] = q + min(max(opening / 2 - q, -reach), reach)
+        return desired
+
+    def _update(self, context: Context, state: State) -> None:
+        x, base = (context.get_discrete_state(index).value() for index in (self._x, self._base))
+        commands = self._commands(context)
+        with profiling.work(profiling.PLANT), self._lock:
+            after = self._advance(x, base, commands)
+        values = state.get_mutable_discrete_state()
+        for index, value in zip(
+            (self._x, self._base, self._actuation, *self._load),
+            (after.x, after.base, after.actuation, *after.loads),
+        ):
+            values.set_value(index, value)
+
+    def _advance(self, x: np.ndarray, base: np.ndarray, commands: dict[str, np.ndarray]) -> Stepped:
+        """One tick. It depends on the arguments alone."""
+        plant, scratch = self.plant, self._scratch
+        plant.SetPositionsAndVelocities(self._inner, x)
+        for k in range(STEPS):
+            desired = self._set_points(x, base, commands, k * TICK / STEPS)
+            self._desired.GetMutableData().get_mutable_value().SetFromVector(desired)
+            after = self.diagram.EvalUniquePeriodicDiscreteUpdate(scratch)
+            if k == STEPS - 1:  # read before the step is taken: what they need of it is in the cache
+                actuation = np.array(plant.get_net_actuation_output_port(self.robot).Eval(self._inner))
+                forces = plant.get_reaction_forces_output_port().Eval(self._inner)
+            scratch.SetDiscreteState(after)
+            x = plant.GetPositionsAndVelocities(self._inner)
+        loads = [np.concatenate([forces[k].rotational(), forces[k].translational()]) for k in self._loads]
+        forward, yaw_rate = commands["base.twist_command"]
+        return Stepped(x, _driven(base, forward, yaw_rate, TICK), actuation, loads)
+
+
+def _driven(base: np.ndarray, forward: float, yaw_rate: float, time: float) -> np.ndarray:
+    """Where x, y, heading are after driving straight on or on an arc."""
+    x, y, heading = base
+    middle = heading + yaw_rate * time / 2
+    way = forward * time
+    return np.array([x + way * math.cos(middle), y + way * math.sin(middle), heading + yaw_rate * time])
+
+
+def _add_gravity(builder: DiagramBuilder, plant: MultibodyPlant, robot: ModelInstanceIndex) -> MultibodyPlant:
+    """Feeds gravity forward to the robot's actuators -> the model that tells it, which must outlive the diagram."""
+    model = MultibodyPlant(plant.time_step())
+    parse(model, "robot")
+    model.Finalize()
+    mode = InverseDynamics.InverseDynamicsMode.kGravityCompensation
+    gravity = builder.AddNamedSystem("gravity_compensation", InverseDynamics(model, mode))
+    torques = builder.AddNamedSystem("gravity_torques", MatrixGain(model.MakeActuationMatrix().T))
+    builder.Connect(plant.get_state_output_port(robot), gravity.get_input_port_estimated_state())
+    builder.Connect(gravity.get_output_port_generalized_force(), torques.get_input_port())
+    builder.Connect(torques.get_output_port(), plant.get_actuation_input_port(robot))
+    return model
+
+
+def _leave_out_looks(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Removes the visual geometry: it would cost time at every step, and cameras and views have scenes of their own."""
+    inspector = scene_graph.model_inspector()
+    source = plant.get_source_id()
+    assert source is not None
+    for id in inspector.GetAllGeometryIds():
+        if inspector.GetProximityProperties(id) is None and inspector.BelongsToSource(id, source):
+            scene_graph.RemoveGeometry(source, id)
