@@ -31,7 +31,9 @@ class _Played:
     def __init__(self, block: Block[Any, Any]):
         self.block = block
         self.held = Held(block.initial())
+        self.ports = {port: f"{block.get_name()}.{port}" for port in block.OUTPUTS}
         self.sources: dict[str, Source] = {}
+        self.asleep: ModeState | None = None  # in what it was found asleep: it sleeps on while this is the mode
         # Every `period` slots from slot `offset` on: work.
         self.works = [(_slots(period), _slots(offset), work) for period, offset, work in block.schedule]
 
@@ -46,11 +48,11 @@ class Player:
         self._recorder = recorder
         self._slot = 0  # the next one whose updates are due
         self._values: dict[str, Any] = {"supervisor.operator": OperatorCommand()}  # what ports hold, by block.port
-        self._station = shown(recording)
+        self._station, self._joined = shown(recording), recording.joined
         blocks = [_Played(block) for block in make_blocks(scenario)]
         for played in blocks:
             for port, value in played.block.initial_outputs().items():
-                self._values[f"{played.block.get_name()}.{port}"] = value
+                self._values[played.ports[port]] = value
         wires = {target: source for source, target in WIRES} | {"supervisor.operator": "supervisor.operator"}
         for played in blocks:
             name = played.block.get_name()
@@ -90,25 +92,24 @@ class Player:
 
     def advance(self, until: float) -> None:
         """Plays on to a tick. As in a simulation it is recorded at its end, and updated when the play goes on."""
+        values, due = self._values, self._due
         while (time := self.time) < until:
-            for played, outputs in self._update(time):
+            mode, done = values["supervisor.mode"], []
+            for played, offset, work in due[self._slot % len(due)]:  # each reads what was there before
+                if self._slot < offset or played.asleep is mode:
+                    continue
+                updated = played.block.update(work, time, played.sources, time, played.held)
+                if updated is None:
+                    played.asleep = mode
+                else:
+                    played.held, outputs = updated
+                    done.append((played, outputs))
+            for played, outputs in done:
                 for port, value in outputs.items():
-                    self._values[f"{played.block.get_name()}.{port}"] = value
+                    values[played.ports[port]] = value
             self._slot += 1
             if self._slot % _SLOTS == 0:
                 self._recorder.record(self.time, self.time)
-
-    def _update(self, time: float) -> list[tuple[_Played, dict[str, Any]]]:
-        """All that is due now; each reads what was there before."""
-        done = []
-        for played, offset, work in self._due[self._slot % len(self._due)]:
-            if self._slot < offset:
-                continue
-            updated = played.block.update(work, time, played.sources, time, played.held)
-            if updated is not None:
-                played.held, outputs = updated
-                done.append((played, outputs))
-        return done
 
     def _read(self, source: str) -> Read:
         """What an output port holds: "station.<port>" or "<block>.<port>"."""
@@ -119,6 +120,8 @@ class Player:
 
     def _recorded(self, name: str) -> Read | None:
         """What a port of the recorder shows; None if that is not in a recording."""
+        if name in self._joined:
+            return self._joined[name].at
         if name in JOINED:
             parts = [self._read(recorded_from(part)) for part in JOINED[name]]
             return lambda time: np.concatenate([part(time) for part in parts])

@@ -1,5 +1,6 @@
 """Compares messages with the recorded ones, tick by tick: bit-equal, or where they differ and by how much."""
 
+import collections
 import dataclasses as dc
 import itertools
 import math
@@ -78,6 +79,7 @@ class Comparison:
         self._next = next(self._recorded, None)
         self._when = 0  # [ns]
         self._replayed: list[tuple[str, bytes]] = []  # at that time
+        self._alike: collections.Counter[tuple[str, ...]] = collections.Counter()  # instants, by what was equal in them
 
     @property
     def identical(self) -> bool:
@@ -105,6 +107,12 @@ class Comparison:
         self._settle()
         while self._next is not None:
             self._compare_next([])
+        for names, instants in self._alike.items():
+            for topic in map(self.topics.__getitem__, names):
+                topic.recorded += instants
+                topic.replayed += instants
+                topic.equal += instants
+        self._alike.clear()
 
     def _settle(self) -> None:
         """Compares all up to the time of the last messages that were written."""
@@ -123,14 +131,13 @@ class Comparison:
         self._next = next(self._recorded, None)
 
     def _compare(self, when: int, recorded: list[tuple[str, bytes]], replayed: list[tuple[str, bytes]]) -> None:
+        if recorded == replayed:
+            self._alike[tuple([topic for topic, _ in recorded])] += 1
+            return
         for topic, _ in recorded:
             self.topics[topic].recorded += 1
         for topic, _ in replayed:
             self.topics.setdefault(topic, TopicDifference()).replayed += 1
-        if recorded == replayed:
-            for topic, _ in recorded:
-                self.topics[topic].equal += 1
-            return
         touched = {topic for topic, _ in itertools.chain(recorded, replayed)}
         for topic in (name for name in self.topics if name in touched):
             pairs = itertools.zip_longest(_of(topic, recorded), _of(topic, replayed))

@@ -17,6 +17,7 @@ passed on. Images that no stage looked at are not in a log: who looks at another
 import bisect
 import collections
 import functools
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -29,7 +30,7 @@ from valve_drake.messages import SIDES, CameraFrame
 from valve_drake.ports import TICK
 from valve_drake.recording.foxglove import NANO, nanoseconds
 from valve_drake.recording.reader import LogReader, Record
-from valve_drake.recording.signals import FRAMES, MEASURED, topic_of
+from valve_drake.recording.signals import FRAMES, JOINED, MEASURED, topic_of
 from valve_drake.stations.camera_rig import decode_image
 from valve_drake.stations.contract import CAMERAS, CONTRACT, PortSpec, station_of
 
@@ -38,7 +39,10 @@ CONSUMERS = {topic_of(port) for port, _, _ in FRAMES.values()}
 _JOINT = "joints."
 _WRENCH = [f"{part}.{k}" for part in ("torque", "force") for k in range(3)]
 VECTORS: dict[str, dict[str, list[str]]] = {  # topic -> port -> where its values are in the topic's messages
-    JOINTS: {port: [_JOINT + name for name in names] for port, names in MEASURED.items()},
+    JOINTS: {
+        port: [_JOINT + name for name in names]
+        for port, names in {**MEASURED, "measured": itertools.chain.from_iterable(MEASURED.values())}.items()
+    },
     **{f"/{side}_wrist/wrench": {f"{side}_wrist.wrench": _WRENCH} for side in SIDES},
 }
 IMAGES = {f"/{camera}/image": camera for camera in CAMERAS}
@@ -65,6 +69,7 @@ class Recording:
 
     end: the last tick up to which everything is there [s]; a damaged log is replayed up to its damage.
     tracks: Track by port of the contract: arrays, Health, or (time, CameraFrame without its image).
+    joined: the same of the ports of the recorder that join several (signals.JOINED).
     requests: the operator's commands.
     Raises ConfigError if the log lacks something that the stages read.
     """
@@ -72,6 +77,7 @@ class Recording:
     def __init__(self, log: LogReader):
         self._log = log
         self.tracks: dict[str, Track] = collections.defaultdict(Track)
+        self.joined: dict[str, Track] = {}
         self.requests = Track()
         needed = {HEALTH, OPERATOR, *VECTORS, *CONSUMERS}
         if missing := sorted(needed - {name for name, topic in log.topics.items() if topic.count > 0}):
@@ -118,7 +124,7 @@ class Recording:
                 if path not in table.columns or path in table.gaps:
                     raise ConfigError(f"{self._log.path}: {topic} has no {path.removeprefix(_JOINT)}")
             values = table.values[:, [table.columns[path] for path in paths]]
-            self.tracks[port] = Track(times, values)
+            (self.joined if port in JOINED else self.tracks)[port] = Track(times, values)
 
     def _add_frames(self, topic: str, time: float, message: Any) -> None:
         for camera, (port, _, frame) in FRAMES.items():
