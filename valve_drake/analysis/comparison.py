@@ -96,7 +96,7 @@ class Comparison:
         if when != self._when:
             self._settle()
             self._when = when
-        self._kinds[topic], data = schemas.serialized(message)
+        self._kinds[topic], data = message if isinstance(message, schemas.Encoded) else schemas.serialized(message)
         self._replayed.append((topic, data))
 
     def flush(self) -> None:

@@ -78,10 +78,9 @@ def calibration(camera: str, time: float, size: tuple[int, int], K: np.ndarray) 
 
 def quaternions(R: np.ndarray) -> np.ndarray:
     """Rotation matrices (n, 3, 3) as unit quaternions x, y, z, w (n, 4)."""
-    M = (R.reshape(-1, 9) @ _TO_SQUARE + np.eye(4).ravel()).reshape(-1, 4, 4)
-    q = M[
-        np.arange(len(M)), M[:, range(4), range(4)].argmax(axis=1)
-    ]  # the column of the largest component is well conditioned
+    M = R.reshape(-1, 9) @ _TO_SQUARE + _EYE
+    # The column of the largest component is well conditioned.
+    q = M.reshape(-1, 4, 4)[_first(len(M)), M[:, ::5].argmax(axis=1)]
     return q / np.sqrt((q * q).sum(axis=1, keepdims=True))
 
 
@@ -103,6 +102,8 @@ def _to_square() -> np.ndarray:
 
 
 _TO_SQUARE = _to_square()
+_EYE = np.eye(4).ravel()
+_first = functools.cache(np.arange)
 
 
 def pose(X: np.ndarray) -> Pose:

@@ -76,7 +76,7 @@ class RecorderSystem(LeafSystem):
         self._sink = sink
         self._ports: dict[str, _Port] = {}
         self._rows = [_Row(signal, [self._declare(*port) for port in signal.inputs.items()]) for signal in signals]
-        self._periods = sorted({row.every for row in self._rows})
+        self._cycle = math.lcm(*(int(row.every) for row in self._rows if row.every != ONCE))  # [ticks]
         self._begun = False
         self._due = functools.cache(self._find_due)
         self.DeclarePeriodicPublishEvent(TICK, 0.0, self._publish)
@@ -107,19 +107,21 @@ class RecorderSystem(LeafSystem):
                 self._begun = True
                 self._rows = [row for row in self._rows if all(port.connected(where) for port in row.ports)]
             tick = round(time / TICK)
-            rows, ports = self._due(*(tick % every == 0 for every in self._periods))
+            rows, ports = self._due(tick if tick == 0 else tick % self._cycle or self._cycle)
             for port in ports:
-                port.read(where)
+                value = port.evaluate(where)
+                if value is not port.value:
+                    port.check(value)
+                    port.value = value
             for row in rows:
                 if row.watched and row.watched.value is row.seen:
                     continue  # the usual case: tested here, since a call for each row would cost more
                 if (values := row.news()) is not None:
                     self._write(row.signal, time, values)
 
-    def _find_due(self, *periods: bool) -> tuple[list["_Row"], list["_Port"]]:
-        """The rows whose periods are due, and their ports."""
-        due = {every for every, now in zip(self._periods, periods) if now}
-        rows = [row for row in self._rows if row.every in due]
+    def _find_due(self, tick: int) -> tuple[list["_Row"], list["_Port"]]:
+        """The rows that are due at a tick, and their ports."""
+        rows = [row for row in self._rows if tick % row.every == 0]
         return rows, list(dict.fromkeys(port for row in rows for port in row.ports))
 
     def _write(self, signal: Signal, time: float, values: list[Any]) -> None:
@@ -137,20 +139,19 @@ class _Port:
         self.kind = kind
         self.value: Any = None
         self._port = port
-        self._evaluate: Callable[[Any], Any] = port.Eval
+        self.evaluate: Callable[[Any], Any] = port.Eval
         self.connected: Callable[[Any], bool] = port.HasValue
         self._type = np.ndarray if isinstance(kind, int) else kind
 
     def listen(self, source: Callable[[float], Any] | None) -> None:
         self.connected = lambda time: source is not None
         if source is not None:
-            self._evaluate = source
+            self.evaluate = source
 
-    def read(self, where: Any) -> None:
-        self.value = self._evaluate(where)
-        if not isinstance(self.value, self._type):
-            # Connect() cannot check this: Drake sees every Python message as Value[object].
-            found = type(self.value).__name__
+    def check(self, value: Any) -> None:
+        """Connect() cannot do this: Drake sees every Python message as Value[object]."""
+        if not isinstance(value, self._type):
+            found = type(value).__name__
             raise TypeError(f"{self._port.GetFullDescription()}: want {self._type.__name__}, got {found}")
 
 

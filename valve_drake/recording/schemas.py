@@ -44,6 +44,8 @@ _SCALARS: dict[type, tuple[int, Callable[[Any], bytes], type]] = {  # protobuf's
     str: (_Field.TYPE_STRING, str.encode, str),
     bytes: (_Field.TYPE_BYTES, bytes, bytes),
 }
+_ZERO = bytes(8)  # 0.0
+LISTS = 256  # of texts whose bytes are kept, since most are as before, a field; raise it for a log of many devices
 _POOL = descriptor_pool.DescriptorPool()
 
 
@@ -105,15 +107,18 @@ def encode(message: Message) -> bytes:
     Written directly from the arrays, which is two to four times as fast as using the protobuf class; encoding takes
     most of the time that logging costs the control loop.
     """
-    codec = _codec(type(message))
+    codec = _codecs.get(type(message)) or _codec(type(message))
     return b"".join([write(value) for write, value in zip(codec.writers, codec.values(message))])
 
 
 def serialized(message: Loggable) -> Encoded:
     """Any message that can be logged, as its protobuf class and its bytes."""
+    if isinstance(message, Encoded):
+        return message
     if isinstance(message, Message):
-        return Encoded(proto_class(type(message)), encode(message))
-    return message if isinstance(message, Encoded) else Encoded(type(message), message.SerializeToString())
+        data = encode(message)
+        return Encoded(_codecs[type(message)].proto, data)
+    return Encoded(type(message), message.SerializeToString())
 
 
 def parsed(message: Encoded) -> Message | Proto:
@@ -257,9 +262,12 @@ def _writer(number: int, field: _FieldCodec) -> Callable[[Any], bytes]:
     def of_fixed_size(value: np.ndarray | None) -> bytes:
         return b"" if value is None else head + value.tobytes()
 
-    def plain(value: Any) -> bytes:
+    def double(value: float) -> bytes:
         data = put(value)
-        return tag + data if data.strip(b"\0") else b""
+        return b"" if data == _ZERO else tag + data  # -0.0 is not zero
+
+    def integer(value: int) -> bytes:
+        return tag + put(value) if value else b""
 
     def with_size(value: Any) -> bytes:
         data = put(value)
@@ -270,15 +278,15 @@ def _writer(number: int, field: _FieldCodec) -> Callable[[Any], bytes]:
         return tag + _varint(len(data)) + data
 
     def each(values: tuple[Any, ...]) -> bytes:
-        return b"".join([message(value) for value in values])
+        return b"".join([message(value) for value in values]) if values else b""
 
     if field.size:
         return of_fixed_size
     if field.repeated and field.proto_type != _Field.TYPE_DOUBLE:
-        return each
+        return each if field.nested else functools.lru_cache(LISTS)(each)
     if field.nested:
         return message
-    return with_size if sized else plain
+    return with_size if sized else double if wire_type == 1 else integer
 
 
 for _kind in _kinds().values():  # a field without a protobuf type fails when the package is imported

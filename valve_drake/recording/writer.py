@@ -89,7 +89,7 @@ class LogWriter:
             self.flush()
         elif self._chunk.size > CHUNK_SIZE:
             self._close_chunk()
-        kind, data = schemas.serialized(message)
+        kind, data = message if isinstance(message, schemas.Encoded) else schemas.serialized(message)
         channel = self._channels.get(topic) or self._define(topic, kind)
         if kind is not channel.kind:
             raise TypeError(f"{topic} holds {channel.kind.__name__}, got {kind.__name__}")
