@@ -110,11 +110,6 @@ def _to_cameras(eyes: StereoHead) -> tuple[np.ndarray, np.ndarray]:
     return np.eye(3, 4), frames.inverse(eyes.X_LR)
 
 
-def moved(X: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """X after a step of (theta, dp)."""
-    return frames.make(X[:, :3] @ frames.rotation(step[:3]), X[:, 3] + step[3:])
-
-
 def information(X_LV: np.ndarray, eyes: StereoHead, marker: Marker, noise: float) -> np.ndarray:
     """Fisher's matrix of (theta, dp): (2, 2, 6, 6) by camera; of all pixels, and of those 3 px off the corners."""
     half = (marker.size[0] / 2, marker.size[1] / 2)
@@ -130,7 +125,8 @@ def information(X_LV: np.ndarray, eyes: StereoHead, marker: Marker, noise: float
         changes = []
         for step in np.diag(steps):
             there, back = (
-                canvas.seen(frames.compose(X_CL, moved(X_LV, sign * step)), half, box)[0].ravel() for sign in (1, -1)
+                canvas.seen(frames.compose(X_CL, frames.stepped(X_LV, sign * step)), half, box)[0].ravel()
+                for sign in (1, -1)
             )
             changes.append(contrast * (there - back) / (2 * step.sum()))
         J = np.array(changes)

@@ -120,9 +120,7 @@ def tag_information(X_CT: np.ndarray, lens: Lens, noise: float) -> tuple[np.ndar
     for inside in (True, False):
         changes = []
         for step in np.diag(steps):
-            there, back = (
-                _darkness(canvas, experiments.moved(X_CT, s * step), box, inside)[0].ravel() for s in (1, -1)
-            )
+            there, back = (_darkness(canvas, frames.stepped(X_CT, s * step), box, inside)[0].ravel() for s in (1, -1))
             changes.append((PLATE[0] - _BLACK) * (there - back) / (2 * step.sum()))
         J = np.array(changes)
         out.append(J @ J.T / (noise**2 + 1 / 12))  # rounding adds a twelfth

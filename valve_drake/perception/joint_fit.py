@@ -141,6 +141,43 @@ def joint_fit(
     not meet, or the blur was far off.
     """
     Q = len(blur)
+    T, frame = _to_common(curves, Q)
+    planes, off = _planes(T, level)
+    normal = seen.normal.copy()
+    normal[:, _BEND, _BEND] += bend
+    H, step, lost = _common_step(T, normal, seen, off)
+    apart = _apart(normal, seen.right)
+    freedom = seen.pixels.reshape(Q, 4).sum(1) - 29
+    variance = (seen.square.reshape(Q, 4).sum(1) + apart) / np.maximum(freedom, 1)
+    fits = (freedom >= 30) & (lost > apart) & (lost - apart < 10 * _MAX_LEVEL_CHI2 * variance)
+    fits &= 1 + step[:, 18] / blur > _MIN_BLUR_RATIO
+
+    final = _moved(curves, step)
+    ends = _corners(final)
+    fits &= np.isfinite(ends).all((1, 2))
+    long = np.flatnonzero(fits & (((ends[:, NEXT] - ends) ** 2).sum(2).min(1) > _MIN_CORNER_SIDE**2))
+    if len(long):
+        light = planes + step[:, :6]
+        J, r, owner = _corner_pixels(sheet, final, ends, light, blur + step[:, 18], frame, variance, long)
+        _add_corners(H, step, J, r, owner, long)
+        final = _moved(curves, step)
+    # What pixels know of an edge's place goes with the inverse of its blur, and H is of the blur before the step.
+    wider = 1 + step[:, 18] / blur
+    fits &= wider > _MIN_BLUR_RATIO
+    chi2, n = scatter.T
+    noise = wider * (chi2 + PRIOR_POINTS * variance) / (n + PRIOR_POINTS)
+    even = final.points(_EVEN_TAU)
+    out: list[tuple[np.ndarray, np.ndarray] | None] = [None] * Q
+    if fits.any():
+        information = _of_nodes(_node_rows(final, ends)[fits], H[fits], noise[fits])
+        for q, one in zip(np.flatnonzero(fits), information):
+            out[q] = even[4 * q : 4 * q + 4], one
+    return out
+
+
+def _to_common(curves: Curves, Q: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """T (Q, 4, 8, 19) that makes a side's own unknowns of the common ones; and the centre (Q, 2) and size (Q,) [px] of
+    the quadrilaterals, about and by which the planes of light are counted."""
     middle = curves.points(_ENDS_AND_MIDDLE)
     halves = middle[:, 1].reshape(Q, 4, 2)
     centre, size = halves.sum(1) / 4, (halves.max(1) - halves.min(1)).max(1)
@@ -149,66 +186,68 @@ def joint_fit(
     T[:] = _COMMON
     T[:, :, 0, 1:3] = T[:, :, 2, 4:6] = place[:, :, 1]
     T[:, :, 1, 1:3] = T[:, :, 3, 4:6] = (place[:, :, 2] - place[:, :, 0]) / 2
+    return T, (centre, size)
+
+
+def _planes(T: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The planes of light (Q, 6) that fit the sides' own levels best, and what those are off them (4 Q, 8, 1)."""
+    Q = len(T)
     to_levels = T[:, :, _LEVELS, :6].reshape(Q, 16, 6)
     back = to_levels.transpose(0, 2, 1)
     planes = np.linalg.solve(back @ to_levels, back @ level.reshape(Q, 16, 1))
     off = np.zeros((4 * Q, 8, 1))
     off[:, _LEVELS] = level[:, :, None] - (to_levels @ planes).reshape(4 * Q, 4, 1)
-    planes = planes[:, :, 0]
+    return planes[:, :, 0], off
+
+
+def _common_step(
+    T: np.ndarray, normal: np.ndarray, seen: Sums, off: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normal matrix (Q, 19, 19) of the common unknowns, their Gauss-Newton step (Q, 19), and by how much the sum of
+    squares then differs from that of the sides' own levels (Q,)."""
+    Q = len(T)
     right = seen.right + (seen.normal @ off)[:, :, 0]
-    normal = seen.normal.copy()
-    normal[:, _BEND, _BEND] += bend
     flat_T = T.reshape(Q, 32, 19)
     back = flat_T.transpose(0, 2, 1)
     H = back @ (normal.reshape(Q, 4, 8, 8) @ T).reshape(Q, 32, 19)
     b = back @ right.reshape(Q, 32, 1)
     step = np.linalg.solve(H, b)
     lost = (off[:, :, 0] * (seen.right + right)).reshape(Q, 32).sum(1) - (b * step).sum((1, 2))
-    step = step[:, :, 0]
+    return H, step[:, :, 0], lost
 
-    apart = _apart(normal, seen.right)
-    freedom = seen.pixels.reshape(Q, 4).sum(1) - 29
-    variance = (seen.square.reshape(Q, 4).sum(1) + apart) / np.maximum(freedom, 1)
-    fits = (freedom >= 30) & (lost > apart) & (lost - apart < 10 * _MAX_LEVEL_CHI2 * variance)
-    fits &= 1 + step[:, 18] / blur > _MIN_BLUR_RATIO
 
+def _moved(curves: Curves, step: np.ndarray) -> Curves:
+    """The sides after a step (Q, 19) of the common unknowns."""
     per_shift = (curves.inward / curves.cosine)[:, None]
+    return dc.replace(curves, coefficient=curves.coefficient + step[:, 6:18].reshape(-1, 3) * per_shift)
 
-    def moved(step: np.ndarray) -> Curves:
-        return dc.replace(curves, coefficient=curves.coefficient + step[:, 6:18].reshape(4 * Q, 3) * per_shift)
 
-    final = moved(step)
-    ends = _corners(final)
-    fits &= np.isfinite(ends).all((1, 2))
-    long = np.flatnonzero(fits & (((ends[:, NEXT] - ends) ** 2).sum(2).min(1) > _MIN_CORNER_SIDE**2))
-    if len(long):
-        light = planes + step[:, :6]
-        J, r, owner = _corner_pixels(sheet, final, ends, light, blur + step[:, 18], (centre, size), variance, long)
-        g = np.zeros((Q, 19, 1))
-        for q in long:
-            own = slice(*np.searchsorted(owner, [q, q + 1]))
-            H[q] += J[own].T @ J[own]
-            g[q, :, 0] = J[own].T @ r[own]
-        step[long] += np.linalg.solve(H[long], g[long])[:, :, 0]
-        final = moved(step)
+def _add_corners(
+    H: np.ndarray, step: np.ndarray, J: np.ndarray, r: np.ndarray, owner: np.ndarray, quads: np.ndarray
+) -> None:
+    """The corners' pixels added to H, and the step that they ask for to `step`, in place."""
+    g = np.zeros((len(H), 19, 1))
+    for q in quads:
+        own = slice(*np.searchsorted(owner, [q, q + 1]))
+        H[q] += J[own].T @ J[own]
+        g[q, :, 0] = J[own].T @ r[own]
+    step[quads] += np.linalg.solve(H[quads], g[quads])[:, :, 0]
+
+
+def _node_rows(curves: Curves, ends: np.ndarray) -> np.ndarray:
+    """(Q, 8, 19): the distances inward of the sides at NODES by the common unknowns. No bend: they are undistorted."""
+    Q = len(ends)
     begin, stop = ends.reshape(-1, 2), ends[:, NEXT].reshape(-1, 2)
-    begin, stop = (np.where(final.flat, p[:, 0], p[:, 1]) for p in (begin, stop))
+    begin, stop = (np.where(curves.flat, p[:, 0], p[:, 1]) for p in (begin, stop))
     t = begin[:, None] + (stop - begin)[:, None] * _NODES
-    K = np.zeros((Q, 8, 19))  # undistorted, none has a bend
-    K[:, _ROWS, _ROWS // 2 * 3 + 6], K[:, _ROWS, _ROWS // 2 * 3 + 7] = 1, final.tau(t).reshape(Q, 8)
-    even = final.points(_EVEN_TAU)
-    # What pixels know of an edge's place goes with the inverse of its blur, and H is of the blur before the step.
-    wider = 1 + step[:, 18] / blur
-    fits &= wider > _MIN_BLUR_RATIO
-    chi2, n = scatter.T
-    noise = wider * (chi2 + PRIOR_POINTS * variance) / (n + PRIOR_POINTS)
-    out: list[tuple[np.ndarray, np.ndarray] | None] = [None] * Q
-    if fits.any():
-        of_nodes = K[fits] @ np.linalg.solve(H[fits], K[fits].transpose(0, 2, 1))
-        information = np.linalg.inv(noise[fits, None, None] * of_nodes)
-        for q, one in zip(np.flatnonzero(fits), information):
-            out[q] = even[4 * q : 4 * q + 4], one
-    return out
+    K = np.zeros((Q, 8, 19))
+    K[:, _ROWS, _ROWS // 2 * 3 + 6], K[:, _ROWS, _ROWS // 2 * 3 + 7] = 1, curves.tau(t).reshape(Q, 8)
+    return K
+
+
+def _of_nodes(K: np.ndarray, H: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Information (Q, 8, 8) of the distances K x of unknowns x with the normal matrix H, by the variance `noise`."""
+    return np.linalg.inv(noise[:, None, None] * (K @ np.linalg.solve(H, K.transpose(0, 2, 1))))
 
 
 def _apart(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -251,31 +290,16 @@ def _corner_pixels(
     """
     corners = (4 * quads[:, None] + _FOUR).ravel()  # numbers among all 4 Q
     before = (4 * quads[:, None] + np.array(BEFORE)).ravel()
-    C = len(corners)
-    u, v = np.rint(ends.reshape(-1, 2)[corners]).astype(int).T[:, :, None] + _WINDOW_PIXELS[:, None]  # (C, n)
-    sides = curves[np.concatenate([corners, before])]  # those that begin at the corners, then those that end there
-    flat, first = sides.flat.reshape(2, C, 1), sides.first[:, None]
-    t, y = (np.where(flat, *both).reshape(2 * C, -1) for both in ((u, v), (v, u)))
-    tau = sides.tau(t)
-    gap = (y - sides.across(t, tau)) * (sides.inward * sides.cosine)[:, None]
-    beyond = (t < first) | (t >= first + sides.count[:, None])
-    near, far = np.minimum(gap[:C], gap[C:]), np.maximum(gap[:C], gap[C:])
-    of = corners // 4
-    (low_u, low_v), (high_u, high_v) = sheet.low[of].T[:, :, None], sheet.high[of].T[:, :, None]
-    keep = (u >= low_u) & (v >= low_v) & (u <= high_u) & (v <= high_v)
-    keep &= beyond[:C] & beyond[C:] & (near > -_CORNER_MARGIN) & (far > -1) & (near < 4)
-    kept = np.flatnonzero(keep)
-    row = kept // u.shape[1]
+    u, v, row, tau, gap = _near_corners(sheet, curves, ends, corners, before)
     corner, behind = corners[row], before[row]
-    q = of[row]
-    u, v = u.ravel()[kept], v.ravel()[kept]
-    b, a = gap.reshape(2, -1)[:, kept] / blur[q]
-    along = basis(tau.reshape(2, -1)[:, kept]).transpose(0, 2, 1)
+    q = corner // 4
+    b, a = gap / blur[q]
+    along = basis(tau).transpose(0, 2, 1)
     normals = curves.normals()
     rho = (normals[before] * normals[corners]).sum(1)[row]
     cover, by_a, by_b = _wedge(a, b, rho)
 
-    n = len(kept)
+    n = len(row)
     place = np.ones((n, 3))
     (middle_u, middle_v), size = frame[0][q].T, frame[1][q]
     place[:, 1], place[:, 2] = (u - middle_u) / size, (v - middle_v) / size
@@ -291,14 +315,36 @@ def _corner_pixels(
         shifts[rows, side] = (scaled * slope)[:, None] * values
     J[:, 6:18] = shifts.reshape(n, 12)
     J[:, 18] = scaled * (a * by_a + b * by_b)
-    value = sheet.pixels[v, u]
-    r = value - (place * light[:, :3]).sum(1) - height * cover
+    r = sheet.pixels[v, u] - (place * light[:, :3]).sum(1) - height * cover
     chi2 = r * r / variance[q]
     good = chi2 < _MAX_PIXEL_SIGMAS**2
+    C = len(corners)
     used = np.bincount(row, good, C)
     mean = np.bincount(row, good * chi2, C) / np.maximum(used, 1)
     good &= ((mean < _MAX_CORNER_CHI2) & (used > 0.9 * np.bincount(row, minlength=C)))[row]
     return J[good], r[good], q[good]
+
+
+def _near_corners(
+    sheet: Sheet, curves: Curves, ends: np.ndarray, corners: np.ndarray, before: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The pixels near C corners that no profile holds: u, v (n,), which corner each is at (n,), and tau (2, n) and the
+    distance inward (2, n) [px] by the side that begins there, and by the one that ends there."""
+    C = len(corners)
+    u, v = np.rint(ends.reshape(-1, 2)[corners]).astype(int).T[:, :, None] + _WINDOW_PIXELS[:, None]  # (C, n)
+    sides = curves[np.concatenate([corners, before])]
+    flat, first = sides.flat.reshape(2, C, 1), sides.first[:, None]
+    t, y = (np.where(flat, *both).reshape(2 * C, -1) for both in ((u, v), (v, u)))
+    tau = sides.tau(t)
+    gap = (y - sides.across(t, tau)) * (sides.inward * sides.cosine)[:, None]
+    beyond = (t < first) | (t >= first + sides.count[:, None])
+    near, far = np.minimum(gap[:C], gap[C:]), np.maximum(gap[:C], gap[C:])
+    (low_u, low_v), (high_u, high_v) = sheet.low[corners // 4].T[:, :, None], sheet.high[corners // 4].T[:, :, None]
+    keep = (u >= low_u) & (v >= low_v) & (u <= high_u) & (v <= high_v)
+    keep &= beyond[:C] & beyond[C:] & (near > -_CORNER_MARGIN) & (far > -1) & (near < 4)
+    kept = np.flatnonzero(keep)
+    both = (values.reshape(2, -1)[:, kept] for values in (tau, gap))
+    return u.ravel()[kept], v.ravel()[kept], kept // u.shape[1], *both
 
 
 def _wedge(a: np.ndarray, b: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
