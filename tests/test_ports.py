@@ -14,6 +14,10 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem, ValueProducer
 from valve_drake.memory import lock
 from valve_drake.messages import Health, Mode, ModeState, Status, StereoPosition
 from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs
+from valve_drake.recording.recorder_system import RecorderSystem
+from valve_drake.stations.camera_rig import CameraSystem
+from valve_drake.stations.hardware import LcmReceiver, LcmSender
+from valve_drake.stations.replay import RecordedStation
 
 
 class CounterInputs(Inputs):
@@ -368,3 +372,10 @@ def test_where_every_block_due_sleeps_drake_forgets_no_value():
         simulator.AdvanceTo((tick + 1) * TICK)
         forgotten.append(seen.is_out_of_date(context))
     assert forgotten == [True, True, True, True, False, False]
+
+
+def test_no_system_of_the_program_is_searched_for_witness_functions_at_every_event():
+    """Where pybind11 binds Drake, the search ends in an exception, unless a C++ function has the name."""
+    bound = type(LeafSystem.get_name).__name__ == "instancemethod"
+    for kind in (Block, RecorderSystem, RecordedStation, CameraSystem, LcmReceiver, LcmSender):
+        assert hasattr(kind, "DoGetWitnessFunctions") == bound

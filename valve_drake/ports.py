@@ -135,7 +135,19 @@ In = TypeVar("In", bound=Inputs)
 M = TypeVar("M")  # memory
 
 
-class Block(LeafSystem, Generic[In, M]):
+class PythonSystem(LeafSystem):
+    """The base of all systems that are written in Python and have no witness functions.
+
+    At every event Drake asks each of them for its witness functions. Where pybind11 binds Drake it then looks for a
+    method of this name and makes an exception for want of one, 0.7 us a time; a C++ function under the name it takes,
+    once and for all, for a sign that nothing is overridden. (Bound by nanobind, Drake calls whatever it finds.)
+    """
+
+    if type(LeafSystem.GetWitnessFunctions).__name__ == "instancemethod":  # pybind11
+        DoGetWitnessFunctions = LeafSystem.GetWitnessFunctions
+
+
+class Block(PythonSystem, Generic[In, M]):
     """A stage on ports. A subclass names its Inputs and its memory's type, sets OUTPUTS and writes `step`.
 
     OUTPUTS: port name -> message class, or vector size. INPUTS: ports beside the annotated ones, for names that come

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import Context, InputPort, LeafSystem
+from pydrake.systems.framework import Context, InputPort
 
 from valve_drake import profiling
-from valve_drake.ports import TICK, Kind
+from valve_drake.ports import TICK, Kind, PythonSystem
 from valve_drake.recording.schemas import Loggable, serialized
 
 ONCE = math.inf  # a period: at the start only
@@ -58,7 +58,7 @@ class Signal:
     urgent: bool = False  # flushed to the disk at once
 
 
-class RecorderSystem(LeafSystem):
+class RecorderSystem(PythonSystem):
     """Writes `signals` to `sink`.
 
     | port                | dir | type                                                       |

@@ -29,13 +29,14 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import Frame
-from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, State
+from pydrake.systems.framework import Context, DiagramBuilder, State
 from pydrake.systems.sensors import CameraInfo
 
 from valve_drake import profiling
 from valve_drake.camera.lens import LensModel, distortion_maps
 from valve_drake.frames import compose, make, rot_z
 from valve_drake.messages import CameraFrame
+from valve_drake.ports import PythonSystem
 from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.simulation_config import CameraConfig, LightConfig, ValveConfig
@@ -251,7 +252,7 @@ class _Film:
         return self
 
 
-class CameraSystem(LeafSystem):
+class CameraSystem(PythonSystem):
     """One camera of the simulated station.
 
     port       dir  type         notes

@@ -28,13 +28,13 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, Diagram, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, Diagram, State
 
 from valve_drake import profiling
 from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.console import complain
 from valve_drake.messages import SIDES, CameraFrame, Health
-from valve_drake.ports import SLOT, TICK
+from valve_drake.ports import SLOT, TICK, PythonSystem
 from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rig import decode_image
 from valve_drake.stations.contract import CAMERAS, CONTRACT, HEAD, station_of
@@ -487,7 +487,7 @@ def _frozen(key: str, values: Values | None, last: Values | None) -> bool:
     return key in NEVER_STILL or any(np.max(np.abs(speed)) > MOVING for speed in speeds)
 
 
-class LcmReceiver(LeafSystem):
+class LcmReceiver(PythonSystem):
     """All output ports of the contract, from a RobotLink."""
 
     def __init__(self, link: RobotLink):
@@ -529,7 +529,7 @@ class LcmReceiver(LeafSystem):
         return calc
 
 
-class LcmSender(LeafSystem):
+class LcmSender(PythonSystem):
     """All input ports of the contract, to a RobotLink at the end of every tick's work."""
 
     def __init__(self, link: RobotLink):

@@ -23,11 +23,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, Diagram, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, Diagram
 
 from valve_drake.checks import ConfigError
 from valve_drake.messages import SIDES, CameraFrame
-from valve_drake.ports import TICK
+from valve_drake.ports import TICK, PythonSystem
 from valve_drake.recording.foxglove import NANO, nanoseconds
 from valve_drake.recording.reader import LogReader, Record
 from valve_drake.recording.signals import FRAMES, JOINED, MEASURED, topic_of
@@ -147,7 +147,7 @@ class Recording:
         return last * TICK
 
 
-class RecordedStation(LeafSystem):
+class RecordedStation(PythonSystem):
     """A Recording on the contract's ports. Its outputs are functions of time; its inputs are not read."""
 
     def __init__(self, recording: Recording):
