@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 
-.PHONY: run test slow lint format readers draw clean
+.PHONY: run test slow robots lint format readers draw clean
 
 run: $(READY)
 	$(BIN)/valve-drake run $(ARGS)
@@ -14,6 +14,11 @@ test: $(READY)
 
 slow: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# Robots of two wheels (160 MB) through import-robot; those that cannot be installed are skipped.
+robots: $(READY)
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[robots]'
+	$(BIN)/python -m pytest -m robots -rs
 
 # What ruff and mypy say of the code; `make format` mends what ruff can.
 lint: $(READY) $(VENV)/.lint

@@ -379,6 +379,9 @@ def _arm_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
             f"    work: {_flow(home)}  " + say("arms.*.work: the arm at the valve, elbow where it should be"),
             f"    stiffness: {_flow(stiffness)}  # {STIFFNESS_PER_EFFORT:g} times the effort limits",
         ]
+        weak = [name for name, effort in zip(names, efforts) if not effort]
+        if weak:
+            lines.append("    " + ask(f"arms.{side}: no effort limit in the model, so no actuator: {', '.join(weak)}"))
         sensor = found.hands[side].sensor
         if sensor is None:
             say_ = ask("arms.*.sensor: no fixed joint beyond the arm: forces come from the joints' torques")
