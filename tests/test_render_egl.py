@@ -202,6 +202,27 @@ def test_a_level_or_upright_edge_lies_where_it_should_in_a_cameras_image(place, 
     assert seen == pytest.approx(place, abs=0.005)
 
 
+def test_what_is_needed_of_a_picture_is_drawn_as_in_the_whole_and_the_rest_left_empty():
+    scene = [
+        (SHAPES["mesh"], at(0.05, -0.03, 0.6, 0.4, 0.7, 0.2), (0.8, 0.5, 0.3, 1.0)),
+        (Box(9, 9, 0.1), at(0, 0, 3.0, 0.2, 0.1, 0), (0.5, 0.5, 0.9, 1.0)),  # reaches beyond the picture on all sides
+        (Sphere(0.2), at(0.2, 0, -1.0), (1.0, 0, 0, 1.0)),  # behind the camera
+    ]
+    corners = np.array([[60.0, 10], [300, 60], [280, 220], [30, 160]])  # a quadrilateral, in either order
+    v, u = np.mgrid[0.5:240, 0.5:320]
+    distance = np.full(u.shape, np.inf)  # inward, from the nearest side
+    for a, b in zip(corners, np.roll(corners, -1, axis=0)):
+        n = np.array([a[1] - b[1], b[0] - a[0]]) / np.linalg.norm(b - a)
+        distance = np.minimum(distance, n[0] * (u - a[0]) + n[1] * (v - a[1]))
+    whole = draw(scene)
+    background = np.rint(255 * np.array(CLEAR))
+    assert (np.abs(whole - background).max(axis=-1) > 2).all()
+    for order in (corners, corners[::-1]):
+        part = draw(scene, settings={"needed": lambda info, order=order: order})
+        assert (part[distance > 1] == whole[distance > 1]).mean() > 0.999  # a clipped side may fall to another sample
+        assert (np.abs(part[distance < -1] - background) <= 1).all()
+
+
 def test_a_mesh_without_materials_takes_the_property_and_one_with_them_its_own(tmp_path):
     (tmp_path / "two.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl other\nKa 1 1 1\n")
     square = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nv 3 -1 0\nv 3 1 0\n"

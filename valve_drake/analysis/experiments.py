@@ -110,14 +110,23 @@ def _to_cameras(eyes: StereoHead) -> tuple[np.ndarray, np.ndarray]:
     return np.eye(3, 4), frames.inverse(eyes.X_LR)
 
 
-def information(X_LV: np.ndarray, eyes: StereoHead, marker: Marker, noise: float) -> np.ndarray:
-    """Fisher's matrix of (theta, dp): (2, 2, 6, 6) by camera; of all pixels, and of those 3 px off the corners."""
+def information(
+    X_LV: np.ndarray,
+    eyes: StereoHead,
+    marker: Marker,
+    noise: float,
+    blur: float = BLUR,
+    contrast: float = float(np.linalg.norm(np.subtract(RED, PLATE))),
+) -> np.ndarray:
+    """Fisher's matrix of (theta, dp): (2, 2, 6, 6) by camera; of all pixels, and of those 3 px off the corners.
+
+    noise, contrast of the marker and what is behind it [grey levels]; blur of the lens [px].
+    """
     half = (marker.size[0] / 2, marker.size[1] / 2)
-    contrast = np.linalg.norm(np.subtract(RED, PLATE))
     steps = np.append(np.full(3, 2e-4), np.full(3, 2e-5 * X_LV[2, 3]))
     out = []
     for lens, X_CL in zip(eyes.lenses(), _to_cameras(eyes)):
-        canvas = Canvas(lens, BLUR)
+        canvas = Canvas(lens, blur)
         X_CV = frames.compose(X_CL, X_LV)
         box = canvas.seen(X_CV, half)[1]
         edge = canvas.off_corners(X_CV, half, box, 3.0).ravel()
@@ -543,11 +552,19 @@ def peers(seed: int = 0, trials: int = 100) -> dict[str, Any]:
     return peers_experiment.peers(seed, trials)
 
 
+def rendered(seed: int = 0, trials: int = 100) -> dict[str, Any]:
+    """See `rendered_bound`, which needs the simulated cameras."""
+    from valve_drake.analysis import rendered_bound
+
+    return rendered_bound.rendered_bound(seed, trials)
+
+
 EXPERIMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     "hand-eye": hand_eye_experiment.hand_eye,
     "table2": table2,
     "table3": table3,
     "bound": bound,
+    "bound_rendered": rendered,
     "robustness": robustness,
     "peers": peers,
 }

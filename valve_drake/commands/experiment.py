@@ -18,6 +18,12 @@ def add(commands: Subcommands) -> None:
     p.add_argument("name", choices=("table2", "table3", "bound", "robustness", "hand-eye", "peers"))
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--trials", type=int, metavar="N", help="images a row (table2: runs of six poses)")
+    p.add_argument(
+        "--images",
+        choices=("drawn", "rendered"),
+        default="drawn",
+        help="of `bound`: exact ones, or what the simulated cameras deliver (default drawn)",
+    )
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.add_argument("--out", type=Path, metavar="DIR", help="write NAME.json there, and the plot of the bound")
     p.set_defaults(command=command)
@@ -26,17 +32,21 @@ def add(commands: Subcommands) -> None:
 def command(options: argparse.Namespace) -> int:
     from valve_drake.analysis import experiments
 
-    numbers, plot = f"{options.name}.json", "estimator_bound.svg"
+    rendered = options.images == "rendered"
+    if rendered:
+        require(options.name == "bound", "--images rendered", "an option of `bound`", options.name)
+    name = "bound_rendered" if rendered else options.name
+    numbers, plot = f"{name}.json", "estimator_bound.svg"
     if options.out is not None:
-        names = (numbers, plot) if options.name == "bound" else (numbers,)
+        names = (numbers, plot) if name == "bound" else (numbers,)
         require(os.path.isdir(options.out), "--out", "a folder that exists", options.out)
         outputs.check_folder(options.out, "--out", names, made_before=_made_before)
         if plot in names and importlib.util.find_spec("matplotlib") is None:
             raise ConfigError("--out of `bound` needs matplotlib for its plot: pip install 'valve-drake[bench]'")
-    result = experiments.run(options.name, options.seed, options.trials)
+    result = experiments.run(name, options.seed, options.trials)
     if options.out is not None:
         outputs.write(options.out / numbers, json.dumps(result, indent=1) + "\n")
-        if options.name == "bound":
+        if name == "bound":
             with outputs.replacing(options.out / plot) as file:
                 experiments.plot_bound(result, file)
     if options.json:

@@ -11,7 +11,7 @@ It is converted in `_Lensed.__init__` alone.
 import dataclasses as dc
 import functools
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import cv2
@@ -34,7 +34,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from valve_drake import profiling
 from valve_drake.camera.lens import LensModel, distortion_maps
-from valve_drake.frames import compose, make, rot_z
+from valve_drake.frames import compose, inverse, make, rot_z
 from valve_drake.messages import CameraFrame
 from valve_drake.ports import PythonSystem
 from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer
@@ -42,6 +42,7 @@ from valve_drake.stations.scene import add_scene
 from valve_drake.stations.simulation_config import CameraConfig, LightConfig, ValveConfig
 
 ROLL = 0.17  # of the render against the image; only edges at this angle lie along the render's rows [rad]
+NEEDED = 2.0  # beyond what the map reads, so much is drawn as well [px of the render]
 MAP_BLUR = 0.4  # standard deviation of the blur that the bilinear map adds [px]
 
 
@@ -73,12 +74,25 @@ class _Lensed:
         width, height = int(np.ceil(u.max()) + 2 - u0), int(np.ceil(v.max()) + 2 - v0)
         # In OpenCV's convention the principal point is at (-u0, -v0); Drake's is half a pixel on.
         self.info = CameraInfo(width, height, focal, focal, 0.5 - u0, 0.5 - v0)
+        # What the map reads, in Drake's convention: a rectangle turned by ROLL that leaves a third of the render free.
+        margin = NEEDED / focal
+        low, high = np.array([x.min(), y.min()]) - margin, np.array([x.max(), y.max()]) + margin
+        X, Y = np.array([low[0], high[0], high[0], low[0]]), np.array([low[1], low[1], high[1], high[1]])
+        self.needed = focal * np.column_stack([c * X + s * Y, c * Y - s * X]) + [0.5 - u0, 0.5 - v0]
         maps = ((u - u0).astype(np.float32), (v - v0).astype(np.float32))
         self._maps = cv2.convertMaps(*maps, cv2.CV_16SC2)  # fixed-point, as remap computes in any case: 1/32 px
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """RGBA as rendered -> (H, W, 3) RGB."""
         return cv2.cvtColor(cv2.remap(image, *self._maps, cv2.INTER_LINEAR), cv2.COLOR_RGBA2RGB)
+
+
+def _same(a: CameraInfo, b: CameraInfo) -> bool:
+    return (
+        a.width() == b.width()
+        and a.height() == b.height()
+        and bool((a.intrinsic_matrix() == b.intrinsic_matrix()).all())
+    )
 
 
 def lights(config: LightConfig) -> list[LightParameter]:
@@ -99,13 +113,16 @@ RENDERER = "cameras"  # its name in the rig's SceneGraph
 BACKGROUND = (0.80, 0.85, 0.90)
 
 
-def _add_vtk(scene_graph: SceneGraph, lights: list[LightParameter], supersample: int) -> None:
+Needed = Callable[[CameraInfo], np.ndarray]  # as of RenderEngineEgl
+
+
+def _add_vtk(scene_graph: SceneGraph, lights: list[LightParameter], supersample: int, needed: Needed) -> None:
     params = RenderEngineVtkParams(lights=lights, default_clear_color=np.array(BACKGROUND))
     scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(params))
 
 
-def _add_egl(scene_graph: SceneGraph, lights: list[LightParameter], supersample: int) -> None:
-    engine = RenderEngineEgl(lights, BACKGROUND, supersample=supersample)
+def _add_egl(scene_graph: SceneGraph, lights: list[LightParameter], supersample: int, needed: Needed) -> None:
+    engine = RenderEngineEgl(lights, BACKGROUND, supersample=supersample, needed=needed)
     add_renderer(scene_graph, RENDERER, engine)
 
 
@@ -129,7 +146,8 @@ class CameraRig:
         scene_graph.set_name("scene_graph")
         self.scene = add_scene(self.plant, valve, marker_size)
         self.plant.Finalize()
-        RENDERERS[camera.renderer](scene_graph, lights(light), camera.supersample)
+        self._lensed = {name: _Lensed(mount.lens) for name, mount in mounts.items()}
+        RENDERERS[camera.renderer](scene_graph, lights(light), camera.supersample, self._needed)
         self._scene_graph = scene_graph
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
@@ -143,7 +161,14 @@ class CameraRig:
         self._noise = _noise_pool(seed, camera.noise)
         self._mounts = dict(mounts)
         self._names = sorted(mounts)
-        self._lensed = {name: _Lensed(mount.lens) for name, mount in mounts.items()}
+
+    def _needed(self, info: CameraInfo) -> np.ndarray:
+        """The corners (4, 2) of what is looked at in a picture [px]: of a camera's, what its lens's map reads."""
+        for lensed in self._lensed.values():
+            if _same(lensed.info, info):
+                return lensed.needed
+        w, h = info.width(), info.height()
+        return np.array([[0.0, 0], [w, 0], [w, h], [0, h]])
 
     def pose(self, q: np.ndarray) -> None:
         """Sets the positions of the renderer's own scene; the running plant is not touched."""
@@ -180,6 +205,15 @@ class CameraRig:
         image = cv2.add(cv2.LUT(image, self._white_balance), noise, dtype=cv2.CV_8U)  # saturates
         return encode_frame(name, capture.time, capture.sequence, image, self._camera.jpeg_quality)
 
+    def marker_pose(self, name: str, q: np.ndarray) -> np.ndarray:
+        """X_CV: where one camera truly has the marker (3, 4)."""
+        self.pose(q)
+        mount = self._mounts[name]
+        marker = self.plant.GetFrameByName("marker", self.scene.valve)
+        frame = self.plant.GetFrameByName(mount.frame, self.scene.robot)
+        X_FV = self.plant.CalcRelativeTransform(self._plant_context, frame, marker)
+        return compose(inverse(mount.X_FC), make(X_FV.rotation().matrix(), X_FV.translation()))
+
     def view(self, X_WC: np.ndarray, q: np.ndarray, width: int, height: int, fov_y: float) -> np.ndarray:
         """A picture from anywhere, for people (height, width, 3)."""
         self.pose(q)
@@ -213,13 +247,13 @@ def decode_image(data: bytes) -> np.ndarray:
     """JPEG bytes -> (H, W, 3) RGB. Raises ValueError if they are no whole image."""
     try:
         # The EXIF orientation is not applied: a calibration refers to the sensor's own pixels.
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if b"\xff\xd9" in data else None
     except (cv2.error, MemoryError):
         image = None
     if image is None:
         raise ValueError("an image that cannot be decoded")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return image
 
 
 @dc.dataclass(frozen=True)

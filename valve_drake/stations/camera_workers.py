@@ -32,6 +32,7 @@ from valve_drake.stations.camera_rig import CameraRig, Capture
 from valve_drake.stations.contract import CAMERAS, HEAD, MATE, WRISTS
 
 WORKERS = 2
+NICENESS = 5  # of the processes: the run goes first where processors are few. 0 where a late image does more harm
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # that the program answers in its own way
 KEPT = 8  # captures of a camera that may still be asked for
 
@@ -52,12 +53,15 @@ class _Worker:
 class CameraWorkers:
     """Makes images in other processes while open. Use: `with CameraWorkers(*rig) as workers:`; rig: of CameraRig.
 
+    niceness: of the processes, as os.nice takes it.
+
     A process with one thread is forked, which spares the workers the imports and each a rig of its own; one with more
     cannot be forked safely, and starts new ones. So it is cheapest to enter before anything that keeps a thread.
     """
 
-    def __init__(self, *rig: Any) -> None:
+    def __init__(self, *rig: Any, niceness: int = NICENESS) -> None:
         self._rig = rig
+        self._niceness = niceness
         self._workers: list[_Worker] = []
         self._captures: dict[str, collections.deque[Any]] = {name: collections.deque(maxlen=KEPT) for name in CAMERAS}
         self._asked: dict[str, dict[int, Capture]] = {name: {} for name in CAMERAS}
@@ -73,10 +77,10 @@ class CameraWorkers:
             with there:
                 if rig is not None:
                     mine = [*(worker.wire for worker in self._workers), wire]
-                    copy, wait = _fork(rig, there.fileno(), mine)
+                    copy, wait = _fork(rig, there.fileno(), self._niceness, mine)
                     self._workers.append(_Worker(copy, wait, wire))
                 else:
-                    process, wait = _spawn(there.fileno())
+                    process, wait = _spawn(there.fileno(), self._niceness)
                     self._workers.append(_Worker(process, wait, wire))
                     _send(wire, self._rig)
         return self
@@ -177,10 +181,10 @@ def _can_fork() -> bool:
 
 
 def _fork(
-    rig: CameraRig, fd: int, mine: Sequence[multiprocessing.connection.Connection]
+    rig: CameraRig, fd: int, niceness: int, mine: Sequence[multiprocessing.connection.Connection]
 ) -> tuple[multiprocessing.context.ForkProcess, Callable[[], int]]:
     """A copy of this process serves `fd`; mine: wires of this process, that the copy must not keep open."""
-    process = multiprocessing.context.ForkProcess(target=_serve_copy, args=(rig, fd, mine), daemon=True)
+    process = multiprocessing.context.ForkProcess(target=_serve_copy, args=(rig, fd, niceness, mine), daemon=True)
     old = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until the copy has put away the program's answers
     try:
         process.start()
@@ -194,7 +198,7 @@ def _fork(
     return process, wait
 
 
-def _serve_copy(rig: CameraRig, fd: int, mine: Sequence[multiprocessing.connection.Connection]) -> None:
+def _serve_copy(rig: CameraRig, fd: int, niceness: int, mine: Sequence[multiprocessing.connection.Connection]) -> None:
     for number in SIGNALS:
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
@@ -202,12 +206,12 @@ def _serve_copy(rig: CameraRig, fd: int, mine: Sequence[multiprocessing.connecti
         wire.close()
     os.setpgid(0, 0)  # a terminal's signals are for the run; in its session Linux weighs both by their niceness
     gc.freeze()  # what was copied stays shared
-    serve(fd, rig)
+    serve(fd, niceness, rig)
 
 
-def _spawn(fd: int) -> tuple[subprocess.Popen[bytes], Callable[[], int]]:
+def _spawn(fd: int, niceness: int) -> tuple[subprocess.Popen[bytes], Callable[[], int]]:
     """A new process serves `fd`."""
-    code = f"from valve_drake.stations.camera_workers import serve; serve({fd})"
+    code = f"from valve_drake.stations.camera_workers import serve; serve({fd}, {niceness})"
     process = subprocess.Popen(
         [sys.executable, "-c", code],
         pass_fds=[fd],
@@ -216,11 +220,11 @@ def _spawn(fd: int) -> tuple[subprocess.Popen[bytes], Callable[[], int]]:
     return process, process.wait
 
 
-def serve(fd: int, rig: CameraRig | None = None) -> None:
+def serve(fd: int, niceness: int, rig: CameraRig | None = None) -> None:
     """The other process: makes what it is asked for with a rig that it has or is told of, ends when nobody is left to
     ask."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides when it ends
-    os.nice(5)  # the run goes first where processors are few
+    os.nice(niceness)
     cv2.setNumThreads(1)
     wire = multiprocessing.connection.Connection(fd)
     try:

@@ -14,7 +14,7 @@ import ctypes
 import dataclasses as dc
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +40,19 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraInfo
 
 SEGMENTS = 48  # of round shapes, as in RenderEngineVtk; raise it where a rim looks angular
 MAX_LIGHTS = 4
+_SIDES = 4  # of the part of a picture that is drawn
+_CLIP_DISTANCE = 0x3000  # GL_CLIP_DISTANCE0, which moderngl has no name for
 
 _VERTEX_SHADER = """
 #version 330
 uniform sampler2D poses;   // row g: the four columns of X_CG, C the camera: x right, y down, z forward
 uniform vec4 projection;   // clip x = p.x x + p.y z, clip y = p.z y + p.w z
 uniform vec2 range;        // near, far
+uniform vec4 sides[4];     // planes through C that bound what is drawn, inward
 uniform int light_count;
 uniform vec4 lights[4];    // in C: direction towards the light, or its position (w = 1)
 uniform float intensities[4];
@@ -57,6 +61,7 @@ in vec3 normal;
 in vec3 color;
 in int geometry;
 out vec3 shade;
+out float gl_ClipDistance[4];
 void main() {
     mat4 X = mat4(texelFetch(poses, ivec2(0, geometry), 0), texelFetch(poses, ivec2(1, geometry), 0),
                   texelFetch(poses, ivec2(2, geometry), 0), texelFetch(poses, ivec2(3, geometry), 0));
@@ -69,6 +74,7 @@ void main() {
         sum += intensities[k] * max(dot(n, to_light), 0.0);
     }
     shade = color * sum;
+    for (int k = 0; k < 4; ++k) gl_ClipDistance[k] = dot(sides[k].xyz, p);
     gl_Position = vec4(projection.x * p.x + projection.y * p.z, projection.z * p.y + projection.w * p.z,
                        (p.z * (range.y + range.x) - 2.0 * range.x * range.y) / (range.y - range.x), p.z);
 }
@@ -102,7 +108,8 @@ class RenderEngineEgl(RenderEngine):
     is Drake's default, one at the camera. default_clear_color: of the background. default_diffuse: of geometry without
     ("phong", "diffuse"). supersample: points of a pixel along each side, 1 to 4; raise it where edges are to be
     smoother, its square is paid for. cull: leave out triangles that are seen from behind, which closed surfaces never
-    show.
+    show. needed: tells for a camera the corners (4, 2) [px] of the convex part of its picture that is looked at, in
+    Drake's convention; what lies outside costs next to nothing and has the background's colour. None: all of it.
 
     Raises ValueError for a light that it cannot make; RuntimeError from the first image where EGL is missing.
     """
@@ -114,6 +121,7 @@ class RenderEngineEgl(RenderEngine):
         default_diffuse: Sequence[float] = (0.9, 0.7, 0.2, 1.0),
         supersample: int = 2,
         cull: bool = True,
+        needed: Callable[[CameraInfo], np.ndarray] | None = None,
     ):
         RenderEngine.__init__(self)
         if supersample not in (1, 2, 3, 4):
@@ -124,8 +132,8 @@ class RenderEngineEgl(RenderEngine):
         for light in lights:
             if light.type not in ("directional", "point") or light.frame not in ("world", "camera"):
                 raise ValueError(f"a light must be directional or point, in world or camera, got {light}")
-        self._settings = (lights, tuple(default_clear_color), tuple(default_diffuse), supersample, cull)
-        self._lights, self._clear, self._diffuse, self._supersample, self._cull = self._settings
+        self._settings = (lights, tuple(default_clear_color), tuple(default_diffuse), supersample, cull, needed)
+        self._lights, self._clear, self._diffuse, self._supersample, self._cull, self._needed = self._settings
         self._X_WC = RigidTransform()
         self._surfaces: dict[GeometryId, Triangles] = {}
         self._rows: dict[GeometryId, int] = {}  # of self._poses
@@ -195,9 +203,14 @@ class RenderEngineEgl(RenderEngine):
             2 * info.center_y() / height - 1,
         )
         uniforms["range"] = (clipping.near(), clipping.far())
+        # Of a whole picture, a little more: its own corners must not fall to rounding.
+        whole = np.array([[-1.0, -1], [width + 1, -1], [width + 1, height + 1], [-1, height + 1]])
+        sides = _sides(info, whole if self._needed is None else self._needed(info))
+        uniforms["sides"] = np.column_stack([sides, np.zeros(_SIDES)]).astype(np.float32).tobytes()
         poses = X_CW.GetAsMatrix4().astype(np.float32) @ self._poses
         k = self._supersample
-        image = self._on_stage.draw(width * k, height * k, poses, uniforms, self._clear, self._cull)
+        seen = self._on_stage.seen(poses, sides, clipping.near())
+        image = self._on_stage.draw(width * k, height * k, poses, uniforms, seen, self._clear, self._cull)
         out = color_image_out.mutable_data
         if k == 1:
             out[...] = image
@@ -232,6 +245,15 @@ def _light_uniforms(lights: Sequence[LightParameter], X_CW: RigidTransform) -> d
             rows[k, :3] = -(X_CW.rotation().multiply(direction) if in_world else direction)
         intensities[k] = light.intensity
     return {"light_count": len(lights), "lights": rows.tobytes(), "intensities": intensities.tobytes()}
+
+
+def _sides(info: CameraInfo, corners: np.ndarray) -> np.ndarray:
+    """Inward normals (4, 3) of the planes through the camera and the sides of a convex quadrilateral (4, 2) [px]."""
+    x = (corners[:, 0] - info.center_x()) / info.focal_x()
+    y = (corners[:, 1] - info.center_y()) / info.focal_y()
+    rays = np.column_stack([x, y, np.ones(_SIDES)])
+    normals = np.cross(rays, np.roll(rays, -1, axis=0))
+    return normals * np.sign(normals @ rays.mean(axis=0))[:, None] / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 # ---------------------------------------------------------------- OpenGL
@@ -302,15 +324,24 @@ class _Stage:
             part = vertices[starts[k] : starts[k + 1]]
             part["position"], part["normal"], part["color"], part["geometry"] = s.points, s.normals, s.colors, k
         # Large surfaces last: most of what lies behind the others is then rejected by depth, before it is shaded.
-        order = sorted(range(len(surfaces)), key=lambda k: _extent(surfaces[k].points))
-        corners = [(starts[k] + surfaces[k].corners).astype(np.int32) for k in order]
+        self._order = np.array(sorted(range(len(surfaces)), key=lambda k: _extent(surfaces[k].points)), int)
+        self._corners = [(starts[k] + surfaces[k].corners).astype(np.int32) for k in range(len(surfaces))]
+        self._boxes = np.array([_box_around(s.points) for s in surfaces], np.float32).reshape(-1, 8, 3)
         with gl.context as context:
             layout = ("3f 3f 3f 1i", "position", "normal", "color", "geometry")
             self._vertices = None
             if len(vertices):
-                buffer, indices = context.buffer(vertices.tobytes()), context.buffer(np.concatenate(corners).tobytes())
-                self._vertices = context.vertex_array(gl.program, [(buffer, *layout)], indices)
+                buffer = context.buffer(vertices.tobytes())
+                self._indices = context.buffer(reserve=4 * sum(map(len, self._corners)), dynamic=True)
+                self._vertices = context.vertex_array(gl.program, [(buffer, *layout)], self._indices)
             self._poses = context.texture((4, max(len(surfaces), 1)), 4, dtype="f4")
+
+    def seen(self, poses: np.ndarray, sides: np.ndarray, near: float) -> np.ndarray:
+        """Corners (3n,) of the triangles of the surfaces that may be seen. poses: X_CG (n, 4, 4); sides: (4, 3)."""
+        P = self._boxes @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+        outside = (P @ sides.T.astype(np.float32) < 0).all(axis=1).any(axis=1) | (P[..., 2] < near).all(axis=1)
+        kept = [self._corners[k] for k in self._order if not outside[k]]
+        return np.concatenate(kept) if kept else np.zeros(0, np.int32)
 
     def draw(
         self,
@@ -318,17 +349,21 @@ class _Stage:
         height: int,
         poses: np.ndarray,
         uniforms: dict[str, Any],
+        seen: np.ndarray,
         clear: Sequence[float],
         cull: bool,
     ) -> np.ndarray:
-        """An image (height, width, 4) uint8 RGBA, to be copied before the next is drawn. poses: X_CG (n, 4, 4)."""
+        """An image (height, width, 4) uint8 RGBA, to be copied before the next is drawn. poses: X_CG (n, 4, 4);
+        seen: corners (3n,) of the triangles to draw."""
         with self.gl.context as context:
             program, target = self.gl.program, self.gl.target(width, height)
             target.use()
             red, green, blue = clear[:3]
             target.clear(red, green, blue, 1.0)
-            if self._vertices is not None:
+            if self._vertices is not None and len(seen):
                 context.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if cull else 0))
+                for k in range(_SIDES):
+                    context.enable_direct(_CLIP_DISTANCE + k)
                 context.front_face = "cw"  # seen in the image's own orientation: its rows run downwards
                 self._poses.write(np.ascontiguousarray(poses.transpose(0, 2, 1)).tobytes())
                 self._poses.use(0)
@@ -339,7 +374,8 @@ class _Stage:
                         uniform.write(value)
                     else:
                         uniform.value = value
-                self._vertices.render(moderngl.TRIANGLES)
+                self._indices.write(seen.tobytes())
+                self._vertices.render(moderngl.TRIANGLES, vertices=len(seen))
             target.read_into(self.gl.pixels(width, height), components=4)
         return self.gl.pixels(width, height)
 
@@ -347,6 +383,12 @@ class _Stage:
 def _extent(points: np.ndarray) -> float:
     """The longest side of the box that holds them."""
     return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+
+
+def _box_around(points: np.ndarray) -> np.ndarray:
+    """The corners (8, 3) of the box that holds them; of none, of one at the origin."""
+    low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
+    return np.where(np.array(list(np.ndindex(2, 2, 2)), bool), high, low)
 
 
 # ---------------------------------------------------------------- surfaces
