@@ -91,6 +91,13 @@ def test_the_processes_end_with_the_block_and_a_lost_one_is_named(rig, rig_argum
     gc.collect()  # what is left of a failed call must not take the program with it
 
 
+def test_the_caller_decides_how_far_the_processes_stand_back(rig, rig_arguments):
+    with CameraWorkers(*rig_arguments, niceness=7) as workers:
+        workers.frame("head_left", captures(rig, 1)[0])
+        pid = workers._worker("head_left").pid
+        assert os.getpriority(os.PRIO_PROCESS, pid) == min(os.nice(0) + 7, 19)
+
+
 FORKED = """
 import pickle, sys, threading, warnings
 from valve_drake.stations.camera_workers import CameraWorkers

@@ -24,8 +24,8 @@ from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig,
 from valve_drake.scenario import Scenario
 from valve_drake.stations.camera_rig import CameraRig, Capture
 from valve_drake.stations.contract import HEAD
-from valve_drake.stations.scene import start_pose
-from valve_drake.stations.simulated import BASE, arm_joints, true_head
+from valve_drake.stations.scene import BASE, arm_joints, start_pose
+from valve_drake.stations.simulated import true_head
 from valve_drake.stations.simulation_config import CameraConfig, ErrorConfig, LightConfig, StartConfig, ValveConfig
 
 BANDS = ((0.6, 0.9), (0.9, 1.4), (1.4, 2.2), (2.2, 3.2))  # of the marker's distance from the left eye [m]
