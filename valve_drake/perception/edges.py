@@ -137,7 +137,8 @@ class _Layout:
     by_y: np.ndarray
     low: np.ndarray  # first and last pixel across that belong to the cut-out
     high: np.ndarray
-    across: np.ndarray  # (M, 1) of a profile's pixels, from its middle
+    across: np.ndarray  # (M, 1) float32 of a profile's pixels, from its middle [px]
+    offset: np.ndarray  # (S, M, 1) of them in `pixels`
     t: np.ndarray
     tau: np.ndarray  # -1..1
     powers: np.ndarray  # (S, 3, N), see `basis`
@@ -157,6 +158,8 @@ class _Layout:
         )
         half = np.repeat(sides.half, 4)[:, None]
         reach = int(half.max()) + 1
+        across = np.arange(-reach, reach + 1)[:, None]
+        by_y = np.where(flat, wide, 1)[:, None]
         k = np.arange(count.max())
         t = first[:, None] + k
         from_end = np.minimum(k, count[:, None] - 1 - k)
@@ -168,10 +171,11 @@ class _Layout:
                 flat, inward, first, count, start, slope, np.zeros((len(count), 3)), 1 / np.sqrt(1 + slope**2)
             ),
             by_t=np.where(flat, 1, wide)[:, None],
-            by_y=np.where(flat, wide, 1)[:, None],
+            by_y=by_y,
             low=low,
             high=high,
-            across=np.arange(-reach, reach + 1)[:, None],
+            across=across.astype(np.float32),
+            offset=by_y[:, None] * across,
             t=t,
             tau=tau,
             powers=basis(tau),
@@ -188,7 +192,7 @@ class _Layout:
         at = self.t[some] * self.by_t + middle.astype(int) * self.by_y
         functions = np.empty((len(line), 5, len(self.across), at.shape[1]), np.float32)
         functions[:, 0] = 1
-        functions[:, 4] = self.pixels.take(at[:, None] + self.by_y[:, None] * self.across, mode="clip")
+        functions[:, 4] = self.pixels.take(at[:, None] + self.offset, mode="clip")
         return _Profiles(self.used[some], self.tau[some], self.room[some], line, middle, functions, powers)
 
 
@@ -267,7 +271,7 @@ def _products(layout: _Layout, profiles: _Profiles, curves: Curves, blur: np.nda
     the time of a fit.
     """
     curve = profiles.line + (curves.coefficient[:, None] @ profiles.powers)[:, 0]
-    z = (profiles.middle - curve).astype(np.float32)[:, None] + layout.across.astype(np.float32)
+    z = (profiles.middle - curve).astype(np.float32)[:, None] + layout.across
     # Nothing counts beyond the cut-out's border; and no pixel enters or leaves at once.
     profiles.room = np.minimum(profiles.room, np.minimum(curve - layout.low, layout.high - curve) + 1)
     weight = profiles.room.astype(np.float32)[:, None] - np.abs(z)

@@ -23,6 +23,7 @@ _UNEVEN_BIAS = 0.1
 _LEAST_WEIGHT = 0.5
 # Sides below this length are biased more, by blur and by what surrounds them; raise it for a blurred lens [px].
 _SHORT_SIDE = 40.0
+_FOUR, _NODES = np.arange(4), np.array(NODES)[:, None]
 
 
 @dc.dataclass(frozen=True)
@@ -70,12 +71,11 @@ def _of_nodes(view: View, bias: np.ndarray) -> np.ndarray:
     common = np.repeat(2 * bias**2, 2)
     root = np.linalg.cholesky(np.linalg.solve(np.eye(8) + view.information * common, view.information))
     along = view.corners[NEXT] - view.corners
+    at_node = np.ones((4, 2, 3))
+    at_node[..., :2] = view.corners[:, None] + along[:, None] * _NODES
+    at_node *= view.scale[:, None, None]
     distance = np.zeros((4, 2, 4, 3))  # of each side's nodes, by each side's l
-    for k in range(4):
-        for n, share in enumerate(NODES):
-            distance[k, n, k, :2] = view.corners[k] + along[k] * share
-            distance[k, n, k, 2] = 1
-            distance[k, n, k] *= view.scale[k]
+    distance[_FOUR, :, _FOUR] = at_node
     return root.T @ distance.reshape(8, 12)
 
 
@@ -93,7 +93,7 @@ def _of_points(view: View, weight: np.ndarray, bias: np.ndarray) -> tuple[np.nda
     rows[:, 1, 0], rows[:, 1, 1] = c11, c21
     rows[:, 2, 1] = np.sqrt(np.maximum(S[:, 1, 1] - c21**2, 0))
     B = np.zeros((4, 3, 4, 3))
-    B[range(4), :, range(4)] = rows
+    B[_FOUR, :, _FOUR] = rows
     half, gap = (S[:, 0, 0] + S[:, 1, 1]) / 2, np.hypot((S[:, 0, 0] - S[:, 1, 1]) / 2, S[:, 0, 1])
     return B.reshape(12, 12), float(np.maximum(half - gap, 0).sum())  # the scatter's smaller eigenvalue is left
 
