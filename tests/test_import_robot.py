@@ -437,8 +437,8 @@ def dae(path, unit="1", points=None, color="0.8 0.1 0.2 1", head=""):
 </library_visual_scenes><scene><instance_visual_scene url="#sc"/></scene></COLLADA>""")
 
 
-def glb(path, boxes, y_up=False):
-    """boxes: (points, linear colour) each a mesh of its own."""
+def glb(path, boxes, y_up=False, picture=b""):
+    """boxes: (points, linear colour) each a mesh of its own. picture: a PNG, whose middle is the colour of each."""
     chunks, views, accessors, meshes, materials = b"", [], [], [], []
     for k, (points, color) in enumerate(boxes):
         points = points @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if y_up else points
@@ -453,9 +453,25 @@ def glb(path, boxes, y_up=False):
             accessors.append(accessor)
             chunks += data + b"\0" * (-len(data) % 4)
         materials.append({"pbrMetallicRoughness": {"baseColorFactor": color}})
-        primitive = {"attributes": {"POSITION": 2 * k}, "indices": 2 * k + 1, "material": k}
+        step = 3 if picture else 2
+        primitive = {"attributes": {"POSITION": step * k}, "indices": step * k + 1, "material": k}
+        if picture:
+            data = np.full((len(points), 2), 0.5, "<f4").tobytes()
+            views.append({"buffer": 0, "byteOffset": len(chunks), "byteLength": len(data)})
+            accessors.append(
+                {"bufferView": len(views) - 1, "componentType": 5126, "count": len(points), "type": "VEC2"}
+            )
+            chunks += data
+            primitive["attributes"]["TEXCOORD_0"] = step * k + 2
+            materials[-1]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
         meshes.append({"primitives": [primitive]})
+    images = {}
+    if picture:
+        views.append({"buffer": 0, "byteOffset": len(chunks), "byteLength": len(picture)})
+        chunks += picture + b"\0" * (-len(picture) % 4)
+        images = {"images": [{"bufferView": len(views) - 1, "mimeType": "image/png"}], "textures": [{"source": 0}]}
     tree = {
+        **images,
         "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(boxes)))}],
@@ -590,6 +606,24 @@ def test_colours_stay_one_a_visual(tmp_path):
         ("two_1", (1.0, 1.0, 1.0)),
         ("two_2", (0.502, 0.0, 0.0)),  # linear 0.214, as a screen shows it
     ]
+
+
+@needs_trimesh
+def test_a_picture_on_a_mesh_is_one_colour_and_needs_its_reader(tmp_path, capsys, monkeypatch):
+    import cv2
+
+    picture = np.full((4, 4, 3), (20, 40, 200), np.uint8)  # BGR
+    png = cv2.imencode(".png", picture)[1].tobytes()
+    glb(tmp_path / "a.glb", [(box(), [1.0, 1.0, 1.0, 1.0])], picture=png)
+    find = importlib.util.find_spec
+    with monkeypatch.context() as context:
+        context.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "PIL" else find(name, *rest))
+        assert imported(tmp_path, mesh_link("a.glb"))[0] == 2
+        assert "link 'a': PIL is missing, which reads the pictures of 'a.glb'" in capsys.readouterr().err
+    pytest.importorskip("PIL")
+    code, folder = imported(tmp_path, mesh_link("a.glb"))
+    assert code == 0 and 'rgba="0.784 0.157 0.078 1"' in (folder / "thing.urdf").read_text()
+    assert "note: mesh a.glb: its picture (texture) is one colour, the mean" in capsys.readouterr().out
 
 
 @needs_trimesh

@@ -6,6 +6,7 @@ listed the wrong way round are turned. Nothing is decimated.
 """
 
 import dataclasses as dc
+import importlib.util
 import io
 import logging
 import re
@@ -23,6 +24,8 @@ THICKNESS = 1e-3  # that a hull of a flat mesh is given [m]
 MARK = "made by valve-drake import-robot"  # in the head of what may be made again
 SUFFIXES = (".stl", ".dae", ".glb", ".gltf", ".obj", ".ply")
 
+INSTALL = "pip install 'valve-drake[robots]'"
+_PICTURES = {".dae": b"<image", ".glb": b'"images"', ".gltf": b'"images"'}
 _INSTANCE = re.compile(rb"<instance_geometry\b[^>]*\burl=[\"']#([^\"']+)")
 _BINDING = re.compile(rb"<bind_material\b.*?</bind_material>", re.DOTALL)
 
@@ -60,7 +63,7 @@ def check_reader() -> None:
         import collada  # noqa: F401
         import trimesh  # noqa: F401
     except ImportError as error:
-        raise ConfigError(f"{error.name} is missing, which reads meshes: pip install 'valve-drake[robots]'") from None
+        raise ConfigError(f"{error.name} is missing, which reads meshes: {INSTALL}") from None
 
 
 def read(path: Path, what: str) -> Surface:
@@ -75,6 +78,9 @@ def read(path: Path, what: str) -> Surface:
         raise ConfigError(f"{what}: {shown(str(path))} is larger than {MAX_BYTES / 1e6:g} MB")
     if suffix == ".dae":
         _refuse_entities(path, what)
+    pictures = _PICTURES.get(suffix)
+    if pictures and importlib.util.find_spec("PIL") is None and pictures in path.read_bytes():
+        raise ConfigError(f"{what}: PIL is missing, which reads the pictures of {shown(path.name)}: {INSTALL}")
     try:
         scene, remarks = _load(trimesh, path)
         parts: list[Part] = []
