@@ -17,7 +17,9 @@ from valve_drake.ports import SLOT, TICK, Block, Inputs, Outputs
 from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.stations.camera_rig import CameraSystem
 from valve_drake.stations.hardware import LcmReceiver, LcmSender
+from valve_drake.stations.plant_system import PlantSystem
 from valve_drake.stations.replay import RecordedStation
+from valve_drake.stations.simulated import TruthSystem
 
 
 class CounterInputs(Inputs):
@@ -377,5 +379,14 @@ def test_where_every_block_due_sleeps_drake_forgets_no_value():
 def test_no_system_of_the_program_is_searched_for_witness_functions_at_every_event():
     """Where pybind11 binds Drake, the search ends in an exception, unless a C++ function has the name."""
     bound = type(LeafSystem.get_name).__name__ == "instancemethod"
-    for kind in (Block, RecorderSystem, RecordedStation, CameraSystem, LcmReceiver, LcmSender):
+    for kind in (
+        Block,
+        RecorderSystem,
+        PlantSystem,
+        TruthSystem,
+        CameraSystem,
+        RecordedStation,
+        LcmReceiver,
+        LcmSender,
+    ):
         assert hasattr(kind, "DoGetWitnessFunctions") == bound

@@ -22,14 +22,13 @@ from pydrake.systems.framework import (
     Diagram,
     DiagramBuilder,
     FixedInputPortValue,
-    LeafSystem,
     State,
 )
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
 from valve_drake import profiling
 from valve_drake.messages import SIDES
-from valve_drake.ports import SLOT, TICK
+from valve_drake.ports import SLOT, TICK, PythonSystem
 from valve_drake.stations.contract import CONTRACT
 from valve_drake.stations.scene import BASE, TORSO, add_scene, arm_joints, parse
 from valve_drake.stations.simulation_config import ValveConfig
@@ -49,7 +48,7 @@ class Stepped(NamedTuple):
     loads: list[np.ndarray]  # on the joints LOADED during the last step (6,) [N m, N]
 
 
-class PlantSystem(LeafSystem):
+class PlantSystem(PythonSystem):
     """Advances the plant once a tick, in slot 2, by the commands of the tick before.
 
     port                             dir  type       notes

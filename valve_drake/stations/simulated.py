@@ -10,14 +10,14 @@ from typing import Annotated, Any
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import AffineSystem, MatrixGain
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
 from valve_drake.messages import DEVICES, SIDES, Health
-from valve_drake.ports import TICK, Block, Inputs, Outputs
+from valve_drake.ports import TICK, Block, Inputs, Outputs, PythonSystem
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, TRUTH, check_contract
@@ -137,7 +137,7 @@ class HealthSystem(Block[Inputs, None]):
         return None, {"health": Health(time=time, devices=self.DEVICES, ages=np.zeros(len(self.DEVICES)))}
 
 
-class TruthSystem(LeafSystem):
+class TruthSystem(PythonSystem):
     """What only a simulation knows, for the recorder and the metrics; the state is that of the instant it is read.
 
     port         dir  type        notes
