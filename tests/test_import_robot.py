@@ -127,7 +127,7 @@ def text_of(found):
         ),
         (
             robot(link("a"), link("b"), joint("j", "a", "b", xyz="0 0 320")),
-            "joint 'j': stands 320 m from its parent: lengths must be metres, these are millimetres",
+            "joint 'j': joint origin is 320 m away: lengths must be metres, these are millimetres",
         ),
         (
             robot(link("a", '<visual><geometry><box size="1 0 1"/></geometry></visual>')),
@@ -155,6 +155,10 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_parsed(tmp_path, monke
     (tmp_path / "a.urdf").write_text(robot(link("a")) + " " * 100)
     with pytest.raises(ConfigError, match="a.urdf: larger than 0.0001 MB"):
         urdf.read(tmp_path / "a.urdf")
+
+
+def test_only_what_is_read_is_checked():
+    read(link("a", MASS + '<collision_checking><origin xyz="?"/><capsule name="test"/></collision_checking>'))
 
 
 def test_prefixes_that_nobody_declared_are_read():
@@ -340,6 +344,7 @@ def test_a_package_is_found_where_people_have_it(tmp_path, monkeypatch):
     other = put("site-packages", "my_urdf")
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "site-packages")])
     assert found("some-robots") == wheel and found("my-urdf") == other
+    assert packages.resolve("package:///my-urdf/meshes/a.stl", None, "here") == other
     assert packages.resolve("model://my_urdf/meshes/a.stl", None, "here") == other
     assert packages.resolve(f"file://{other}", None, "here") == other
     assert packages.resolve("../meshes/a.stl", above.parent.parent / "urdf", "here").samefile(above)
@@ -849,7 +854,9 @@ def test_the_draft_knows_arms_grippers_head_and_lift(tmp_path):
     assert len(tree["arm_speed"]) == 5 and "weld" not in tree
 
 
-@pytest.mark.parametrize(("left", "right"), [("l", "r"), ("L", "R"), ("Left", "Right"), ("LEFT", "RIGHT")])
+@pytest.mark.parametrize(
+    ("left", "right"), [("l", "r"), ("L", "R"), ("LShoulder", "RShoulder"), ("Left", "Right"), ("LEFT", "RIGHT")]
+)
 def test_the_sides_are_told_by_any_usual_name(left, right):
     found = read(*two_arms(7, left, right))
     mend(found)

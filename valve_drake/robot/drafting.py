@@ -20,7 +20,9 @@ STIFFNESS_PER_EFFORT = 130.0  # a joint's stiffness [N m/rad] for each N m of it
 Ask = Callable[[str], str]  # notes what is to be done -> the comment that says it
 Boxes = Mapping[str, np.ndarray]  # link -> (2, 3) least and greatest corner of its shapes in its own frame [m]
 
-_SIDE = re.compile(r"left|right|Left|Right|LEFT|RIGHT|(?<![A-Za-z0-9])[lrLR](?![A-Za-z0-9])|^[lrLR](?=[aA]rm|ARM)")
+_SIDE = re.compile(
+    r"left|right|Left|Right|LEFT|RIGHT|(?<![A-Za-z0-9])[lrLR](?![A-Za-z0-9])|^[lrLR](?=[aA]rm|ARM)|^[LR](?=[A-Z][a-z])"
+)
 _OTHER = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
 _OTHER |= {right: left for left, right in _OTHER.items()}
 _FINGER = re.compile(r"grip|finger|thumb|jaw|knuckle|hand", re.IGNORECASE)

@@ -43,7 +43,7 @@ def resolve(url: str, beside: Path | None, what: str) -> Path:
         raise ConfigError(
             f"{what}: a file must be named by a path or package://, model:// or file://, got {shown(url)}"
         )
-    name, _, inside = rest.partition("/")
+    name, _, inside = rest.lstrip("/").partition("/")  # some write package:///name
     found = []
     for folder in packages(name, beside):
         if _is_file(folder / inside):

@@ -307,81 +307,88 @@ def _root(links: dict[str, ET.Element], joints: dict[str, Joint], source: str) -
 
 def _check_numbers(robot: Robot) -> None:
     """All that is read as numbers later, and the sizes that Drake would end the program over."""
-
-    def number(element: ET.Element, key: str, where: str) -> float | None:
-        return None if (row := row_of(element, key, 1, where)) is None else float(row[0])
-
-    def row_of(element: ET.Element, key: str, count: int, where: str) -> np.ndarray | None:
-        if element.get(key) is None:
-            return None
-        try:
-            return numbers(element, key, count, ())
-        except ValueError:
-            rule = "a finite number" if count == 1 else f"{count} finite numbers"
-            value = shown(element.get(key))
-            raise ConfigError(f"{robot.source}: {where}: {element.tag} {key} must be {rule}, got {value}") from None
-
     for name, link in robot.links.items():
-        where = f"link {shown(name)}"
-        for part in link.iter():
-            if part.tag == "origin":
-                row_of(part, "xyz", 3, where), row_of(part, "rpy", 3, where)
-            elif part.tag == "mass":
-                number(part, "value", where)
-            elif part.tag == "inertia":
-                for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"):
-                    number(part, key, where)
-            elif part.tag == "color":
-                row_of(part, "rgba", 4, where)
-            elif part.tag == "mesh":
-                scale = row_of(part, "scale", 3, where)
-                if scale is not None and not np.all(np.abs(scale) > 1e-9):
-                    raise ConfigError(
-                        f"{robot.source}: {where}: mesh scale must not be 0, got {shown(part.get('scale'))}"
-                    )
+        where = f"{robot.source}: link {shown(name)}"
+        for part in link:
+            if part.tag == "inertial":
+                _check_inertial(part, where)
             elif part.tag in ("visual", "collision"):
-                kinds = [item.tag for item in part.iterfind("geometry/*")]
-                if len(kinds) != 1 or not (kinds[0] in _SHAPES or kinds[0].startswith("drake:")):
-                    rule = f"one of {', '.join(_SHAPES)}"
-                    raise ConfigError(
-                        f"{robot.source}: {where}: {part.tag} geometry must be {rule}, got {shown(kinds)}"
-                    )
-            elif part.tag in ("box", "cylinder", "sphere", "capsule"):
-                keys = {"box": ["size"], "sphere": ["radius"]}.get(part.tag, ["radius", "length"])
-                for key in keys:
-                    sizes = row_of(part, key, 3 if part.tag == "box" else 1, where)
-                    if sizes is None or not np.all(sizes > 0):
-                        value = shown(part.get(key))
-                        raise ConfigError(f"{robot.source}: {where}: {part.tag} {key} must be > 0, got {value}")
-                    if sizes.max() > MAX_LENGTH:
-                        raise ConfigError(
-                            f"{robot.source}: {where}: {part.tag} {key} must be metres, got {sizes.max():g}"
-                        )
-    for name, joint in robot.joints.items():
-        where = f"joint {shown(name)}"
-        for part in joint.element:
-            if part.tag == "origin":
-                xyz = row_of(part, "xyz", 3, where)
-                row_of(part, "rpy", 3, where)
-                if xyz is not None and np.linalg.norm(xyz) > MAX_LENGTH:
-                    raise ConfigError(
-                        f"{robot.source}: {where}: stands {np.linalg.norm(xyz):g} m from its parent: "
-                        "lengths must be metres, these are millimetres"
-                    )
-            elif part.tag == "axis":
-                axis = row_of(part, "xyz", 3, where)
-                if axis is not None and joint.moving and np.linalg.norm(axis) < 1e-9:
-                    raise ConfigError(f"{robot.source}: {where}: axis xyz must not be 0, got {shown(part.get('xyz'))}")
-            elif part.tag in ("limit", "dynamics", "mimic"):
-                for key in ("lower", "upper", "effort", "velocity", "damping", "friction", "multiplier", "offset"):
-                    if part.tag != "limit" or key not in ("effort", "velocity") or _finite(part.get(key)):
-                        number(part, key, where)
-        low, high = joint.range if joint.moving else (0.0, 0.0)
-        if low > high:
-            raise ConfigError(f"{robot.source}: {where}: limit lower must be below upper, got {low:g} and {high:g}")
+                _check_shape(part, where)
+    for joint in robot.joints.values():
+        _check_joint(joint, f"{robot.source}: joint {shown(joint.name)}")
     for material in robot.element.findall("material"):
         for color in material.iter("color"):
-            row_of(color, "rgba", 4, f"material {shown(material.get('name'))}")
+            _row(color, "rgba", 4, f"{robot.source}: material {shown(material.get('name'))}")
+
+
+def _row(element: ET.Element, key: str, count: int, where: str) -> np.ndarray | None:
+    """(count,) numbers; None where the attribute is missing. Raises ConfigError."""
+    if element.get(key) is None:
+        return None
+    try:
+        return numbers(element, key, count, ())
+    except ValueError:
+        rule = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise ConfigError(f"{where}: {element.tag} {key} must be {rule}, got {shown(element.get(key))}") from None
+
+
+def _check_origin(part: ET.Element, where: str) -> None:
+    for origin in part.findall("origin"):
+        xyz = _row(origin, "xyz", 3, where)
+        _row(origin, "rpy", 3, where)
+        if xyz is not None and np.linalg.norm(xyz) > MAX_LENGTH:
+            raise ConfigError(
+                f"{where}: {part.tag} origin is {np.linalg.norm(xyz):g} m away: lengths must be metres, these are "
+                "millimetres"
+            )
+
+
+def _check_inertial(part: ET.Element, where: str) -> None:
+    _check_origin(part, where)
+    for mass in part.findall("mass"):
+        _row(mass, "value", 1, where)
+    for inertia in part.findall("inertia"):
+        for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"):
+            _row(inertia, key, 1, where)
+
+
+def _check_shape(part: ET.Element, where: str) -> None:
+    _check_origin(part, where)
+    for color in part.iterfind("material/color"):
+        _row(color, "rgba", 4, where)
+    shapes = part.findall("geometry/*")
+    tags = [item.tag for item in shapes]
+    if len(tags) != 1 or not (tags[0] in _SHAPES or tags[0].startswith("drake:")):
+        raise ConfigError(f"{where}: {part.tag} geometry must be one of {', '.join(_SHAPES)}, got {shown(tags)}")
+    shape = shapes[0]
+    if shape.tag == "mesh":
+        scale = _row(shape, "scale", 3, where)
+        if scale is not None and not np.all(np.abs(scale) > 1e-9):
+            raise ConfigError(f"{where}: mesh scale must not be 0, got {shown(shape.get('scale'))}")
+    for key in {"box": ["size"], "sphere": ["radius"]}.get(shape.tag, ["radius", "length"]):
+        if shape.tag == "mesh" or shape.tag.startswith("drake:"):
+            break
+        sizes = _row(shape, key, 3 if shape.tag == "box" else 1, where)
+        if sizes is None or not np.all(sizes > 0):
+            raise ConfigError(f"{where}: {shape.tag} {key} must be > 0, got {shown(shape.get(key))}")
+        if sizes.max() > MAX_LENGTH:
+            raise ConfigError(f"{where}: {shape.tag} {key} must be metres, got {sizes.max():g}")
+
+
+def _check_joint(joint: Joint, where: str) -> None:
+    _check_origin(joint.element, where)
+    for axis in joint.element.findall("axis"):
+        xyz = _row(axis, "xyz", 3, where)
+        if xyz is not None and joint.moving and np.linalg.norm(xyz) < 1e-9:
+            raise ConfigError(f"{where}: axis xyz must not be 0, got {shown(axis.get('xyz'))}")
+    for part in joint.element:
+        if part.tag in ("limit", "dynamics", "mimic"):
+            for key in ("lower", "upper", "effort", "velocity", "damping", "friction", "multiplier", "offset"):
+                if key not in ("effort", "velocity") or _finite(part.get(key)):
+                    _row(part, key, 1, where)
+    low, high = joint.range if joint.moving else (0.0, 0.0)
+    if low > high:
+        raise ConfigError(f"{where}: limit lower must be below upper, got {low:g} and {high:g}")
 
 
 def _finite(text: str | None) -> bool:
