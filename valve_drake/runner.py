@@ -7,10 +7,7 @@ import contextlib
 import dataclasses as dc
 import functools
 import gc
-import importlib.metadata
 import json
-import platform
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -57,6 +54,7 @@ from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.hardware import AHEAD, RobotLink
 from valve_drake.stations.replay import Recording
 from valve_drake.task.modes import TERMINAL
+from valve_drake.versions import versions
 
 STEP = 1 / 32  # between two looks at the mode [s]
 TAIL = 1.5  # recorded after the end: a stopped base takes a second to stand [s]
@@ -116,25 +114,6 @@ class Result:
             "log_error": self.log_error,
             "recording": str(self.html) if self.html else None,
         }
-
-
-def versions() -> dict[str, str]:
-    """What the run's numbers may depend on; nothing of the day or the machine's names."""
-    names = ("valve-drake", "drake", "numpy", "opencv-python-headless", "mcap", "protobuf")
-    out = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in names:
-        try:
-            out[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            out[name] = "unknown"
-    try:
-        here = Path(__file__).resolve().parent
-        describe = ["git", "describe", "--always", "--dirty", "--abbrev=40"]
-        git = subprocess.run(describe, cwd=here, capture_output=True, text=True, timeout=5)
-        out["commit"] = git.stdout.strip() if git.returncode == 0 else "unknown"
-    except (OSError, subprocess.SubprocessError):
-        out["commit"] = "unknown"
-    return out
 
 
 def make_recorder(sink: Sink, scenario: Scenario) -> RecorderSystem:

@@ -23,7 +23,7 @@ from valve_drake.campaign.statistics import interval
 from valve_drake.campaign.trial import Record, Trial, perform, turned
 from valve_drake.checks import ConfigError, require
 from valve_drake.config import Uniform
-from valve_drake.runner import versions
+from valve_drake.versions import versions
 
 PLAN, RECORDS, LOGS = "campaign.json", "records", "logs"
 KEEP = ("all", "failed", "none")  # logs
