@@ -6,7 +6,6 @@ listed the wrong way round are turned. Nothing is decimated.
 """
 
 import dataclasses as dc
-import importlib.util
 import io
 import logging
 import re
@@ -20,7 +19,6 @@ from valve_drake.checks import ConfigError, shown
 CREASE = 35.0  # faces that enclose more make an edge [deg]; lower it where round parts show facets' edges as smooth
 MAX_BYTES = 200_000_000  # of a mesh's file
 MAX_COLORS = 8  # of a mesh that paints its corners; more are a picture, of which the mean is taken
-THICKNESS = 1e-3  # that a hull of a flat mesh is given [m]
 MARK = "made by valve-drake import-robot"  # in the head of what may be made again
 SUFFIXES = (".stl", ".dae", ".glb", ".gltf", ".obj", ".ply")
 
@@ -79,7 +77,7 @@ def read(path: Path, what: str) -> Surface:
     if suffix == ".dae":
         _refuse_entities(path, what)
     pictures = _PICTURES.get(suffix)
-    if pictures and importlib.util.find_spec("PIL") is None and pictures in path.read_bytes():
+    if pictures and not _reads_pictures() and pictures in path.read_bytes():
         raise ConfigError(f"{what}: PIL is missing, which reads the pictures of {shown(path.name)}: {INSTALL}")
     try:
         scene, remarks = _load(trimesh, path)
@@ -132,6 +130,14 @@ def _load(trimesh: Any, path: Path) -> tuple[Any, list[str]]:
 def _dae_instances(data: bytes) -> set[str]:
     """The geometries that a DAE places."""
     return {name.decode("utf-8", "replace") for name in _INSTANCE.findall(data)}
+
+
+def _reads_pictures() -> bool:
+    try:
+        import PIL.Image  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 def _refuse_entities(path: Path, what: str) -> None:
@@ -305,10 +311,6 @@ def hull_text(points: np.ndarray, title: str, what: str) -> tuple[str, int]:
     from pydrake.geometry import Convex
 
     cloud = np.unique(np.round(points, 5), axis=0)
-    spread = np.linalg.eigh(np.cov(cloud.T))[1].T if len(cloud) > 2 else np.eye(3)
-    thin = [axis for axis in spread if np.ptp(cloud @ axis) < THICKNESS]
-    for axis in thin:  # a sheet, or a wire
-        cloud = np.concatenate([cloud - THICKNESS / 2 * axis, cloud + THICKNESS / 2 * axis])
     try:
         hull = Convex(points=cloud.T, label=title).GetConvexHull()
     except Exception as error:
