@@ -7,9 +7,9 @@ the valve turns by ANGLE between 3.5 s and 4.5 s, and servo is entered twice.
 import cv2
 import numpy as np
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from robot_facts import ROBOT
 
 from valve_drake.frames import compose, inverse, make, planar, rot_y, rot_z, rotation
-from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import (
     SIDES,
     CameraFrame,
@@ -69,12 +69,12 @@ def torso(t):
 
 
 def X_WV(t):
-    head = compose(planar(*base(0.0)), GEOMETRY.X_BL(torso(0.0)))
+    head = compose(planar(*base(0.0)), ROBOT.X_BL(torso(0.0)))
     return compose(head, make(rot_y(0.2), np.array([0.1, -0.05, 1.5])), make(rot_z(0.3 - valve_angle(t)), np.zeros(3)))
 
 
 def X_LV(t):
-    return compose(inverse(compose(planar(*base(t)), GEOMETRY.X_BL(torso(t)))), X_WV(t))
+    return compose(inverse(compose(planar(*base(t)), ROBOT.X_BL(torso(t)))), X_WV(t))
 
 
 def mode_at(t):
@@ -85,7 +85,7 @@ def mode_at(t):
 def estimate(t, sequence):
     true = X_LV(t)
     X = make(true[:, :3] @ rotation(ERROR_W), true[:, 3] + ERROR_P)
-    X_OL = compose(planar(*base(t)), GEOMETRY.X_BL(torso(t)))
+    X_OL = compose(planar(*base(t)), ROBOT.X_BL(torso(t)))
     return RectangleEstimate(
         time=t,
         sequence=sequence,

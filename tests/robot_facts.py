@@ -1,14 +1,17 @@
-"""Facts of the robot for the tests, taken from the package, so that no test has a copy of its own."""
+"""The robot of the tests, and facts of it that no file states: its right arm mirrors the left one."""
 
 import numpy as np
 
-from valve_drake.behaviors.kinematic_approach import KinematicApproachConfig
-from valve_drake.kinematics import MIRROR, both_arms
 from valve_drake.messages import LEFT
+from valve_drake.robot import description
+from valve_drake.robot.robot import Robot
 
-HOME = np.array(KinematicApproachConfig().home)  # left arm (6,)
-ARMS_HOME = both_arms(HOME)  # (12,)
-AT_VALVE = np.array([0.11, 0.72, -1.73, 0.13, 1.01, -0.07])  # left arm, its hand on a handle (6,)
+ROBOT = Robot.load(description.find(description.OURS))
+MIRROR = np.array([1.0, -1, -1, -1, -1, -1])  # left arm to right arm: all axes but the lateral first one change sign
+HOME = ROBOT.arms[LEFT].home  # left arm (6,)
+ARMS_HOME = ROBOT.home  # (12,)
+AT_VALVE = ROBOT.arms[LEFT].work  # left arm, its hand on a handle (6,)
+LIMITS = ROBOT.arms[LEFT].high  # +- of either arm (6,) [rad]
 
 
 def arm(side: str, left: np.ndarray) -> np.ndarray:

@@ -5,13 +5,13 @@ import dataclasses as dc
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+from robot_facts import ROBOT
 
 from valve_drake.behaviors import valve_search
 from valve_drake.behaviors.base_approach import BaseApproachConfig, MedianPlace, Memory, step
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, inverse, make, rot_z, wrap
-from valve_drake.kinematics import RobotGeometry
 from valve_drake.messages import (
     Command,
     Mode,
@@ -173,7 +173,7 @@ def test_on_the_fine_approach_the_gaze_does_not_lose_the_marker(bearing, distanc
     """With valve_search moving the head, and sightings only while both cameras see the marker."""
     scene = Scene(np.array([1.0, -2.0, 0.4]), np.random.default_rng(1))
     wheels = Wheels(place(scene, np.deg2rad(bearing), distance))
-    head = RobotGeometry().head_pose
+    head = ROBOT.head_pose
     gaze = {"memory": valve_search.Memory(), "torso": np.zeros(3), "states": set()}
     p_OV = np.array([*scene.marker[:2], 1.0])
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from robot_facts import ARMS_HOME as HOME
+from robot_facts import ROBOT
 
-from valve_drake.behaviors.grasp_geometry import StanceConfig, best_arc, find_stance, hand_in_valve, standoff, turned
+from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances, hand_in_valve, standoff, turned
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, inverse, make, planar
-from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import SIDES
 from valve_drake.perception.marker import Marker
 from valve_drake.stations.scene import panel_pose
@@ -18,28 +18,31 @@ ON_BAR = (0.0, 0.03, 0.0)  # off the handle, in the hand: a finger touches the b
 STRAIGHT = dict.fromkeys(SIDES, np.array([0.0, 0, 1]))
 
 
+def stances(config: StanceConfig) -> Stances:
+    return Stances(ROBOT, MARKER, config, STRAIGHT, lambda X_BV, q: True)
+
+
 @pytest.fixture(scope="module")
 def model():
-    return CollisionModel(MARKER)
+    return CollisionModel(ROBOT, MARKER)
 
 
 @pytest.fixture(scope="module")
 def X_BV():
     X_OV = compose(panel_pose(ValveConfig(height=1.0)), make(np.eye(3), np.array([0, 0, -MARKER.panel_depth])))
     config = StanceConfig(distance_min=0.7, distance_max=0.78)
-    base, margin = find_stance(X_OV, np.pi / 2, GEOMETRY, MARKER, config, STRAIGHT)
+    base, margin = stances(config).find(X_OV, np.pi / 2)
     assert margin > 0.5
     return compose(inverse(planar(*base)), X_OV)
 
 
 def arms(X_BV: np.ndarray, *, back: float = 0.0, aside=(0.0, 0.0, 0.0)) -> np.ndarray:
     """Both hands on their handles, drawn back from the panel by `back` and moved by `aside` (in the hand) [m]."""
-    X_HV = compose(inverse(GEOMETRY.X_BH()), X_BV)
-    arc = best_arc(X_BV, np.pi / 2, GEOMETRY, MARKER, StanceConfig(), STRAIGHT)
+    arc = stances(StanceConfig()).best_arc(X_BV, np.pi / 2)
     q = []
-    for side, near in (("left", arc.q_left), ("right", arc.q_right)):
-        X_HG = standoff(compose(X_HV, hand_in_valve(side, arc.swapped, MARKER)), STRAIGHT[side], back)
-        q.append(GEOMETRY.arm_inverse(make(X_HG[:, :3], X_HG[:, 3] + X_HG[:, :3] @ aside), side, near))
+    for side, near in arc.q.items():
+        X_BG = standoff(compose(X_BV, hand_in_valve(side, arc.swapped, MARKER)), STRAIGHT[side], back)
+        q.append(ROBOT.inverse(side, make(X_BG[:, :3], X_BG[:, 3] + X_BG[:, :3] @ aside), near))
     return np.concatenate(q)
 
 
@@ -56,7 +59,7 @@ def test_hands_before_the_handles_are_free(model, X_BV):
 
 def test_open_fingers_fit_round_the_bar_with_the_same_room_on_both_sides(X_BV):
     """Robot, valve and grasp agree to the millimetre: (85 - 25) / 2 from every pad to the bar."""
-    wide = CollisionModel(MARKER, 0.05, opening=0.085)
+    wide = CollisionModel(ROBOT, MARKER, 0.05, opening=0.085)
     rows = [line for line in wide.touching(X_BV, arms(X_BV)) if "::pad" in line and "::bar" in line]
     assert len(rows) == 24 and all(row.endswith(": 30 mm") for row in rows)
 
@@ -70,7 +73,7 @@ def test_a_finger_on_the_bar_is_not_free(model, X_BV):
 
 
 def test_fingers_less_open_have_less_room(X_BV):
-    assert not CollisionModel(MARKER, opening=0.04).is_free(X_BV, arms(X_BV))
+    assert not CollisionModel(ROBOT, MARKER, opening=0.04).is_free(X_BV, arms(X_BV))
 
 
 def test_one_hand_is_enough(model, X_BV):
@@ -98,11 +101,13 @@ def test_hands_that_touch_each_other_are_not_free(model):
 def test_clearance_is_the_distance_that_counts(X_BV):
     """The same pose, nearer than one clearance and further than the other."""
     q = arms(X_BV, back=0.05)
-    distances = [float(line.split(": ")[1].split(" ")[0]) for line in CollisionModel(MARKER, 0.2).touching(X_BV, q)]
+    distances = [
+        float(line.split(": ")[1].split(" ")[0]) for line in CollisionModel(ROBOT, MARKER, 0.2).touching(X_BV, q)
+    ]
     least = min(distances) / 1e3
     assert 0.012 < least < 0.2
-    assert not CollisionModel(MARKER, least + 0.005).is_free(X_BV, q)
-    assert CollisionModel(MARKER, least - 0.005).is_free(X_BV, q)
+    assert not CollisionModel(ROBOT, MARKER, least + 0.005).is_free(X_BV, q)
+    assert CollisionModel(ROBOT, MARKER, least - 0.005).is_free(X_BV, q)
 
 
 def test_the_bar_turns_with_the_marker(model, X_BV):

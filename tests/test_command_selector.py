@@ -5,10 +5,9 @@ import dataclasses as dc
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
-from robot_facts import HOME, arm
+from robot_facts import HOME, LIMITS, ROBOT, arm
 
 from valve_drake.checks import ConfigError
-from valve_drake.kinematics import ARM_LIMITS
 from valve_drake.messages import Command, Health, Mode, ModeState, RobotState, SelectorReport, Verdict
 from valve_drake.motion import braking_speed, follow
 from valve_drake.supervisor.command_selector import (
@@ -29,7 +28,7 @@ from valve_drake.task.modes import BEHAVIORS, TABLE
 DT = 1 / 128
 CONFIG = CommandSelectorConfig()
 INITIAL = {port: np.full(size, 0.01) for port, size in PORTS.items()}
-BOUNDS = bounds(CONFIG)
+BOUNDS = bounds(CONFIG, ROBOT.arms)
 
 
 def command(time: float, **groups) -> Command:
@@ -50,7 +49,7 @@ class Bench:
 
     def __init__(self, mode: Mode = Mode.REACH, config: CommandSelectorConfig = CONFIG):
         self.config = config
-        self.memory = start(config, INITIAL)
+        self.memory = start(config, INITIAL, ROBOT.arms)
         self.tick_count = 0
         self.mode = ModeState(mode=mode.value, activation=1)
         self.health = Health()
@@ -179,9 +178,9 @@ def test_before_the_first_valid_robot_state_the_outputs_are_the_initial_values(b
 def test_initial_values_that_do_not_fit_are_refused_by_port():
     for wrong in (np.zeros(5), np.full(6, np.nan)):
         with pytest.raises(ConfigError, match="left_arm.position_command"):
-            start(CONFIG, INITIAL | {"left_arm.position_command": wrong})
+            start(CONFIG, INITIAL | {"left_arm.position_command": wrong}, ROBOT.arms)
     with pytest.raises(ConfigError, match="right_gripper.force_limit"):
-        start(CONFIG, {p: v for p, v in INITIAL.items() if p != "right_gripper.force_limit"})
+        start(CONFIG, {p: v for p, v in INITIAL.items() if p != "right_gripper.force_limit"}, ROBOT.arms)
 
 
 # ---------------------------------------------------------------- limits
@@ -362,7 +361,7 @@ def test_a_silent_block_means_hold(group):
 
 
 def test_hold_brakes_within_the_acceleration_limit_and_inside_the_range():
-    limit = ARM_LIMITS[1]
+    limit = LIMITS[1]
     for room in (0.15, 0.02):  # enough to brake in, and not
         bench = Bench()
         k = 0
@@ -507,11 +506,11 @@ def test_follow_lands_exactly_for_periods_that_are_no_power_of_two():
 def rig(**inputs) -> Rig:
     robot = RobotState(left_arm=HOME, right_arm=arm("right", HOME), history=np.zeros((1, 7)))
     fixed = {"mode": ModeState(mode="reach", activation=1), "robot_state": robot, "health": Health()}
-    return Rig(CommandSelectorSystem(CONFIG, INITIAL), **fixed | inputs)
+    return Rig(CommandSelectorSystem(CONFIG, INITIAL, ROBOT.arms), **fixed | inputs)
 
 
 def test_ports():
-    assert ports(CommandSelectorSystem(CONFIG, INITIAL)) == {
+    assert ports(CommandSelectorSystem(CONFIG, INITIAL, ROBOT.arms)) == {
         "mode": "in abstract",
         "robot_state": "in abstract",
         "health": "in abstract",
@@ -567,7 +566,7 @@ def test_block_refuses_a_wrong_message_and_a_wrong_config():
     with pytest.raises(TypeError, match="want Command"):
         rig(image_servo=ModeState()).run(0.1)
     with pytest.raises(ConfigError, match="initial"):
-        CommandSelectorSystem(CONFIG, {})
+        CommandSelectorSystem(CONFIG, {}, ROBOT.arms)
 
 
 @pytest.mark.parametrize(
@@ -582,7 +581,7 @@ def test_block_refuses_a_wrong_message_and_a_wrong_config():
 )
 def test_bad_config_is_refused_by_name(changes, words):
     with pytest.raises(ConfigError, match=words):
-        CommandSelectorSystem(CommandSelectorConfig(**changes), INITIAL)
+        CommandSelectorSystem(CommandSelectorConfig(**changes), INITIAL, ROBOT.arms)
 
 
 def test_verdicts_and_modes_travel_as_plain_text():

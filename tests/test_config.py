@@ -12,14 +12,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from robot_facts import ROBOT
 
 from valve_drake import cli, config, resources
 from valve_drake import scenario as scenarios
-from valve_drake.behaviors.grasp_geometry import StanceConfig, find_stance
+from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances
 from valve_drake.checks import ConfigError
 from valve_drake.config import Config, Number, Uniform, number, numbers, plain, table
 from valve_drake.frames import make, rot_x, rot_y
-from valve_drake.kinematics import ARM_LIMITS, GEOMETRY
 from valve_drake.messages import SIDES
 from valve_drake.perception.marker import Marker
 from valve_drake.scenario import Scenario
@@ -187,17 +187,13 @@ def test_speeds_and_positions_are_bounded_by_the_robots_own_limits():
     assert high["command_selector.gripper_force"] == joints["left_finger_1"]["effort"]
     assert high["command_selector.gripper_speed"] == joints["left_finger_1"]["velocity"]
     assert high["command_selector.gripper_high"] == 2 * joints["left_finger_1"]["upper"]
-    home = LEAVES["kinematic_approach.home"].rule
-    assert list(home.high) == ARM_LIMITS.tolist() and list(home.low) == (-ARM_LIMITS).tolist()
 
 
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
         (["angle=6.28", "supervisor.angle_limit=6.0"], "angle must be at most supervisor.angle_limit, 6, got 6.28"),
-        (["image_servo.opening=0.07"], "image_servo.opening must be that of kinematic_approach, 0.085, got 0.07"),
-        (["hybrid_rotation.opening=0.07"], "hybrid_rotation.opening must be that of kinematic_approach"),
-        (["command_selector.gripper_high=0.08"], "kinematic_approach.opening must be at most command_selector"),
+        (["image_servo.opening=0.07"], "unknown key image_servo.opening"),
         (["command_selector.gripper_force=60"], "hybrid_rotation.grip_force must be at most command_selector"),
         (["command_selector.torso_high=[0.3, 1.1, 1.6]"], "valve_search.sweep_waist must be within command_selector"),
         (["command_selector.torso_high=[0.6, 1.0, 1.6]"], "valve_search.pitch_high must be within command_selector"),
@@ -208,7 +204,6 @@ def test_speeds_and_positions_are_bounded_by_the_robots_own_limits():
         (["stance.arc_step=1e-9"], "stance.arc_step must be within [0.1, 1], got 1e-09"),
         (["stance.distance_max=1e300"], "stance.distance_max must be within"),
         (["kinematic_approach.joint_speed=1e300"], "kinematic_approach.joint_speed must be within"),
-        (["kinematic_approach.home=[9,9,9,9,9,9]"], "kinematic_approach.home[0] must be within [-2.97, 2.97], got 9"),
         (["supervisor.max_age={nonsense: 1}"], "supervisor.max_age must be given for base, torso"),
         (["hardware.channels={5: a}"], "hardware.channels must be given for base.command"),
         (["command_selector.arm_limit=[1,1,1,1,1,1]"], "unknown key command_selector.arm_limit"),
@@ -227,12 +222,6 @@ def test_what_would_fail_later_is_refused_at_once(overrides, words):
     assert words in str(error.value)
 
 
-def test_a_narrower_robot_is_taken_if_all_agree():
-    narrow = [f"{block}.opening=0.07" for block in ("kinematic_approach", "image_servo", "hybrid_rotation")]
-    loaded = scenarios.load(None, [*narrow, "command_selector.gripper_high=0.075"])
-    assert loaded.hybrid_rotation.opening == 0.07
-
-
 def test_the_longest_search_for_a_stance_that_a_scenario_allows_ends_soon():
     longest = StanceConfig(distance_min=0.5, distance_max=0.5 + 39 * 0.01, distance_step=0.01, arc_step=0.1)
     longest.margin_enough = 1.0
@@ -240,7 +229,7 @@ def test_the_longest_search_for_a_stance_that_a_scenario_allows_ends_soon():
     X_OV = make(rot_y(math.pi / 2) @ rot_x(-math.pi / 2) @ np.eye(3), np.array([2.0, 0, 1.0]))
     straight = {side: np.array([0.0, 0, 1.0]) for side in SIDES}
     begin = time.process_time()
-    find_stance(X_OV, 6.29, GEOMETRY, Marker(), longest, straight)
+    Stances(ROBOT, Marker(), longest, straight, lambda X_BV, q: True).find(X_OV, 6.29)
     assert time.process_time() - begin < 5.0  # 40 distances x 2 x 64 poses x 2 arms at worst
 
 

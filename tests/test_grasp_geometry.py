@@ -4,14 +4,13 @@ import dataclasses as dc
 
 import numpy as np
 import pytest
+from robot_facts import ROBOT
 
 from valve_drake import resources
 from valve_drake.behaviors.grasp_geometry import (
     StanceConfig,
+    Stances,
     angle_turned,
-    best_arc,
-    check_arc,
-    find_stance,
     hand_in_valve,
     standoff,
     turned,
@@ -19,9 +18,9 @@ from valve_drake.behaviors.grasp_geometry import (
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, compose, inverse, make, planar, rotation, wrap
-from valve_drake.kinematics import GEOMETRY, lateral
 from valve_drake.messages import SIDES
 from valve_drake.perception.marker import Marker
+from valve_drake.robot.kinematics import OUTWARD
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
 
@@ -37,8 +36,12 @@ def valve_at(height: float, tilt: float = 0.0, bar: float = 0.0, *, yaw: float =
     return turned(compose(planar(2.0, 0.4, 0.0), X_WP, X_PV), np.deg2rad(bar))
 
 
+def stances(is_free=lambda X_BV, q: True, **changes) -> Stances:
+    return Stances(ROBOT, MARKER, dc.replace(CONFIG, **changes), VIEW, is_free)
+
+
 def stance(X_OV: np.ndarray, turn: float, **changes):
-    return find_stance(X_OV, np.deg2rad(turn), GEOMETRY, MARKER, dc.replace(CONFIG, **changes), VIEW)
+    return stances(**changes).find(X_OV, np.deg2rad(turn))
 
 
 # ---------------------------------------------------------------- the turn's sign
@@ -77,7 +80,7 @@ def test_angle_turned_is_not_moved_by_errors_of_the_axis():
 def test_hands_hold_the_marked_ends_of_the_bar(swapped):
     for side in SIDES:
         X_VG = hand_in_valve(side, swapped, MARKER)
-        end = -lateral(side) * (-1 if swapped else 1)  # x_V points to the robot's right when it faces a level bar
+        end = -OUTWARD[side] * (-1 if swapped else 1)  # x_V points to the robot's right when it faces a level bar
         assert X_VG[:, 3] == pytest.approx([end * MARKER.handle_radius, 0, MARKER.handle_depth])
         assert X_VG[:, 2] == pytest.approx([0, 0, 1])  # approaches into the panel
         assert abs(X_VG[1, 1]) == 1  # closes across the bar
@@ -133,7 +136,7 @@ def test_a_comfortable_stance_exists_over_the_whole_range(height, tilt, bar, tur
     assert CONFIG.distance_min - 1e-9 <= off @ forward <= CONFIG.distance_max + 1e-9
     # and it holds what it says, along the arc at a finer step
     X_BV = compose(inverse(planar(*base)), X_OV)
-    fine = best_arc(X_BV, np.deg2rad(turn), GEOMETRY, MARKER, dc.replace(CONFIG, arc_step=0.02), VIEW)
+    fine = stances(arc_step=0.02).best_arc(X_BV, np.deg2rad(turn))
     assert fine.margin > margin - 0.1
 
 
@@ -158,13 +161,13 @@ def test_the_arc_says_where_it_starts_and_that_the_whole_of_it_is_reached():
     X_OV = valve_at(1.0)
     base, _ = stance(X_OV, 90, distance_min=0.70, distance_max=0.76)
     X_BV = compose(inverse(planar(*base)), X_OV)
-    arc = best_arc(X_BV, np.pi / 2, GEOMETRY, MARKER, CONFIG, VIEW)
-    for side, q in (("left", arc.q_left), ("right", arc.q_right)):
-        X_BG = compose(GEOMETRY.X_BH(), GEOMETRY.arm_forward(q, side))
-        assert X_BG == pytest.approx(compose(X_BV, hand_in_valve(side, arc.swapped, MARKER)), abs=1e-9)
+    arc = stances().best_arc(X_BV, np.pi / 2)
+    for side, q in arc.q.items():
+        X_BG = ROBOT.forward(side, q)
+        assert X_BG == pytest.approx(compose(X_BV, hand_in_valve(side, arc.swapped, MARKER)), abs=1e-6)
     # too near and too far are worse, and further it is out of reach
     margins = [
-        best_arc(compose(make(np.eye(3), np.array([d, 0, 0])), X_BV), np.pi / 2, GEOMETRY, MARKER, CONFIG, VIEW).margin
+        stances().best_arc(compose(make(np.eye(3), np.array([d, 0, 0])), X_BV), np.pi / 2).margin
         for d in (0.0, 0.12, 0.20, 0.40)
     ]
     assert 0 < margins[0] < margins[1] > margins[2] and margins[3] == -1
@@ -173,11 +176,11 @@ def test_the_arc_says_where_it_starts_and_that_the_whole_of_it_is_reached():
 def test_handles_are_shared_the_better_way():
     """A valve turned by half a turn looks the same with its ends exchanged: the hands must not cross."""
     X_BV = compose(inverse(planar(1.2, 0.4, 0.3)), valve_at(1.0))
-    straight = best_arc(X_BV, np.pi / 2, GEOMETRY, MARKER, CONFIG, VIEW)
-    other = best_arc(turned(X_BV, np.pi), np.pi / 2, GEOMETRY, MARKER, CONFIG, VIEW)
+    straight = stances().best_arc(X_BV, np.pi / 2)
+    other = stances().best_arc(turned(X_BV, np.pi), np.pi / 2)
     assert (straight.swapped, other.swapped) == (False, True)
-    assert straight.q_left == pytest.approx(other.q_left) and straight.q_right == pytest.approx(other.q_right)
-    crossed = check_arc(X_BV, np.pi / 2, True, GEOMETRY, MARKER, CONFIG, VIEW)
+    assert all(straight.q[side] == pytest.approx(other.q[side]) for side in SIDES)
+    crossed = stances().check_arc(X_BV, np.pi / 2, True)
     assert crossed.margin < straight.margin
 
 

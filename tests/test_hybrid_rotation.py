@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+from robot_facts import ROBOT
 
 from valve_drake.behaviors import hybrid_rotation
 from valve_drake.behaviors.grasp_geometry import hand_in_valve, turned
@@ -25,7 +26,6 @@ from valve_drake.behaviors.hybrid_rotation import (
 from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, cross, inverse, make, rot_y, rot_z, rotation, rotation_vector
-from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, GraspPlan, Mode, ModeState, RobotState, Status
 from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK
@@ -34,8 +34,8 @@ CONFIG = HybridRotationConfig()
 MARKER = Marker()
 VIEW = {LEFT: np.array([-0.5, 0, 0.866]), RIGHT: np.array([0.5, 0, 0.866])}
 QUARTER = np.pi / 2
-FACING = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # R_HV of a valve straight ahead
-OPEN = np.array([CONFIG.opening, CONFIG.open_force])
+FACING = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # R_BV of a valve straight ahead
+OPEN = np.array([ROBOT.opening, CONFIG.open_force])
 
 STIFFNESS = 80e3  # of an arm's joint servos, at the grip point [N/m]
 ANGULAR = 9e3  # [N m/rad]
@@ -64,25 +64,25 @@ class Bench:
         noise: float = 0.3,
     ):
         self.rng = np.random.default_rng(seed)
-        self.law = HybridRotation(CONFIG, MARKER, GEOMETRY, VIEW)
+        self.law = HybridRotation(CONFIG, MARKER, ROBOT, VIEW)
         self.friction, self.travel, self.spin = friction, travel, spin
         self.noise = noise
         self.bias = self.rng.normal(size=(2, 6)) * [0.1, 0.1, 0.1, 2, 2, 2]
-        self.X_HV = make(FACING @ rot_y(0.05) @ rot_z(-bar), np.array([0.66, 0.01, -0.06]))
+        self.X_BV = make(FACING @ rot_y(0.05) @ rot_z(-bar), np.array([0.66, 0.01, 0.99]))
         seen = rotation(self.rng.normal(size=3) * off * 10)
-        plan = make(self.X_HV[:, :3] @ seen, self.X_HV[:, 3] + self.rng.normal(size=3) * off)
-        self.plan = GraspPlan(found=True, X_BV=compose(GEOMETRY.X_BH(), plan))
+        plan = make(self.X_BV[:, :3] @ seen, self.X_BV[:, 3] + self.rng.normal(size=3) * off)
+        self.plan = GraspPlan(found=True, X_BV=plan)
         self.angle = 0.0
         self.held: list[np.ndarray | None] = [None, None]  # X_VG of a hand that holds the bar
         self.slips = [False, False]  # a hand whose pads slide carries nothing, though it stays closed
         self.missing = [False, False]  # no bar between the pads of this hand
         self.X = [compose(plan, hand_in_valve(side, False, MARKER)) for side in SIDES]  # of the hands, true
-        self.q = [GEOMETRY.arm_inverse(X, side) for X, side in zip(self.X, SIDES)]  # commanded, as the servos have it
+        self.q = [ROBOT.inverse(side, X) for X, side in zip(self.X, SIDES)]  # commanded, as the servos have it
         self.true = list(self.q)
         self.velocity = [np.zeros(6), np.zeros(6)]
         self.gripper = [OPEN[0], OPEN[0]]
         self.pressed = [0.0, 0.0]
-        self.load = np.zeros((2, 6))  # on the hands at their grip points, in H
+        self.load = np.zeros((2, 6))  # on the hands at their grip points, in B
         self.memory = Memory()
         self.time, self.activation = 20.0, 0
         self.rows: list = []
@@ -94,16 +94,16 @@ class Bench:
 
         Returns the couple of the forces on the valve, its stiffness, and the moments at the pads before these spin.
         """
-        X_HV, couple, stiffness, moments = turned(self.X_HV, self.angle), 0.0, 0.0, []
-        u = -X_HV[:, 2]
+        X_BV, couple, stiffness, moments = turned(self.X_BV, self.angle), 0.0, 0.0, []
+        u = -X_BV[:, 2]
         for k, Xc in enumerate(wanted):
             holds = self.held[k] is not None and not self.slips[k]
-            X = compose(X_HV, self.held[k]) if holds else Xc
+            X = compose(X_BV, self.held[k]) if holds else Xc
             m = -ANGULAR * rotation_vector(Xc[:, :3] @ X[:, :3].T)
             f = -STIFFNESS * (Xc[:, 3] - X[:, 3])
             over = m @ u - min(max(m @ u, -self.spin), self.spin)
             if holds:
-                r = X[:, 3] - X_HV[:, 3]
+                r = X[:, 3] - X_BV[:, 3]
                 couple -= u @ cross(r, f)
                 stiffness += STIFFNESS * (r @ r - (u @ r) ** 2)
                 moments.append(-float(m @ u))
@@ -113,7 +113,7 @@ class Bench:
 
     def turn_valve(self) -> None:
         """Dry friction: the valve turns just until the couple is down to it."""
-        wanted = [GEOMETRY.arm_forward(q, side) for q, side in zip(self.q, SIDES)]
+        wanted = [ROBOT.forward(side, q) for q, side in zip(self.q, SIDES)]
         couple, stiffness, moments = self.springs(wanted)
 
         def rest(turn: float) -> float:
@@ -130,7 +130,7 @@ class Bench:
             self.springs(wanted)
         for k in range(2):
             if self.held[k] is not None and not self.slips[k]:
-                self.held[k] = compose(inverse(turned(self.X_HV, self.angle)), self.X[k])
+                self.held[k] = compose(inverse(turned(self.X_BV, self.angle)), self.X[k])
 
     def close(self, k: int, wanted: float, force: float) -> None:
         opening = self.gripper[k] + np.clip(wanted - self.gripper[k], -0.15 * TICK, 0.15 * TICK)
@@ -138,7 +138,7 @@ class Bench:
         if opening <= MARKER.handle_width and not self.missing[k]:
             opening, self.pressed[k] = MARKER.handle_width, force
             if self.held[k] is None:
-                self.held[k] = compose(inverse(turned(self.X_HV, self.angle)), self.X[k])
+                self.held[k] = compose(inverse(turned(self.X_BV, self.angle)), self.X[k])
         elif opening > MARKER.handle_width + 1e-4:
             self.held[k] = None
         self.gripper[k] = opening
@@ -148,9 +148,9 @@ class Bench:
         for k, side in enumerate(SIDES):
             R = self.X[k][:, :3]
             f, m = R.T @ self.load[k, 3:], R.T @ self.load[k, :3]
-            at_sensor = np.concatenate([m + cross(np.array([0, 0, GEOMETRY.grip_behind]), f), f])
+            at_sensor = np.concatenate([m + cross(ROBOT.hands[side].X_SG[:, 3], f), f])
             noise = self.rng.normal(size=6) * self.noise * np.array([0.01] * 3 + [1] * 3)
-            raw.append(at_sensor + gravity_wrench(R, GEOMETRY, side) + self.bias[k] + noise)
+            raw.append(at_sensor + gravity_wrench(R, ROBOT.hands[side]) + self.bias[k] + noise)
         return RobotState(
             time=self.time,
             left_arm=self.true[0],
@@ -175,7 +175,7 @@ class Bench:
         self.command = command
         self.turn_valve()
         for k, side in enumerate(SIDES):
-            q = GEOMETRY.arm_inverse(self.X[k], side, self.true[k])
+            q = ROBOT.inverse(side, self.X[k], self.true[k])
             self.velocity[k] = (q - self.true[k]) / TICK
             self.true[k] = q
         self.time += TICK
@@ -328,8 +328,8 @@ def test_a_wrist_never_swings_round_at_its_limit():
     """J4 can leave its range only by a whole turn: the hand keeps its last command instead."""
     law = Bench().law
     q = (np.array([1.05, 0.65, -1.9, 3.315, 1.25, 0.0]), np.array([1.05, -0.65, 1.9, 0, -1.25, 0]))
-    X = tuple(GEOMETRY.arm_forward(q[k], side) for k, side in enumerate(SIDES))
-    beyond = (GEOMETRY.arm_forward(q[0] + [0, 0, 0, 0.02, 0, 0], LEFT), X[1])
+    X = tuple(ROBOT.forward(side, q[k]) for k, side in enumerate(SIDES))
+    beyond = (ROBOT.forward(LEFT, q[0] + [0, 0, 0, 0.02, 0, 0]), X[1])
     memory = law._command(Memory(X=X, q=q), beyond)
     assert np.array_equal(memory.q[0], q[0]) and memory.X[0] is X[0]
     assert memory.X[1] is X[1] and memory.q[1] == pytest.approx(q[1], abs=1e-9)
@@ -425,7 +425,7 @@ def test_a_grasp_is_closed_tugged_and_relaxed():
     bench.run(Mode.REACH, limit=1.0)
     stages = []
     tug = []
-    u = -bench.X_HV[:, 2]
+    u = -bench.X_BV[:, 2]
 
     def watch(b):
         stages.append(b.memory.stage)
@@ -500,9 +500,9 @@ def test_release_bleeds_the_forces_before_it_opens(friction, after):
     assert np.linalg.norm(load[:, 3:], axis=1).max() < 2.0
     assert np.linalg.norm(load[:, :3], axis=1).max() < 0.5
     assert bench.angle == pytest.approx(angle, abs=1e-3) and abs(bench.angle - after) < 0.01
-    assert widths[0] > 0.9 * CONFIG.opening  # open before they are drawn back
+    assert widths[0] > 0.9 * ROBOT.opening  # open before they are drawn back
     for k, side in enumerate(SIDES):  # hands open, drawn back along the camera's view
-        assert bench.gripper[k] == pytest.approx(CONFIG.opening)
+        assert bench.gripper[k] == pytest.approx(ROBOT.opening)
         moved = X[k][:, :3].T @ (bench.X[k][:, 3] - X[k][:, 3])
         assert moved == pytest.approx(-CONFIG.retreat * VIEW[side], abs=0.003)
 
@@ -524,7 +524,7 @@ def test_a_release_that_follows_others_motion_starts_where_the_hands_are():
     lower = [X.copy() for X in bench.X]
     for X in lower:
         X[:, 3] += [0.0, 0.0, -0.05]
-    bench.q = bench.true = [GEOMETRY.arm_inverse(X, side, q) for X, side, q in zip(lower, SIDES, bench.q)]
+    bench.q = bench.true = [ROBOT.inverse(side, X, q) for X, side, q in zip(lower, SIDES, bench.q)]
     bench.run(Mode.SERVO, limit=0.05)
     q = np.concatenate(bench.true)
     bench.run(Mode.RELEASE, limit=0.05)
@@ -536,25 +536,25 @@ def test_a_release_that_follows_others_motion_starts_where_the_hands_are():
 
 @pytest.mark.parametrize("side, s", [(LEFT, 1), (RIGHT, -1)])
 def test_gravity_wrench_is_the_hands_weight_at_its_centre_of_mass(side, s):
-    weight = 9.81 * GEOMETRY.hand_mass
-    x, _, z = GEOMETRY.p_SHand
-    level = GEOMETRY.arm_forward(np.zeros(6), side)[:, :3]  # y of the hand is up
-    assert gravity_wrench(level, GEOMETRY, side) == pytest.approx([z * weight, 0, -s * x * weight, 0, -weight, 0])
+    weight = 9.81 * ROBOT.hands[side].mass
+    x, _, z = ROBOT.hands[LEFT].p_SCom
+    level = ROBOT.forward(side, np.zeros(6))[:, :3]  # y of the hand is up
+    assert gravity_wrench(level, ROBOT.hands[side]) == pytest.approx([z * weight, 0, -s * x * weight, 0, -weight, 0])
     down = np.column_stack([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # z of the hand points to the floor
-    assert gravity_wrench(down, GEOMETRY, side) == pytest.approx([0, -s * x * weight, 0, 0, 0, weight])
+    assert gravity_wrench(down, ROBOT.hands[side]) == pytest.approx([0, -s * x * weight, 0, 0, 0, weight])
 
 
 def test_contact_wrench_is_moved_to_the_grip_point_and_freed_of_bias_and_weight():
-    R = GEOMETRY.arm_forward(np.array([0.4, 0.5, -1.6, 0.3, 0.9, -0.4]), LEFT)[:, :3]
+    R = ROBOT.forward(LEFT, np.array([0.4, 0.5, -1.6, 0.3, 0.9, -0.4]))[:, :3]
     f, m, bias = np.array([3.0, -4, 5]), np.array([0.1, 0.2, -0.3]), np.arange(6.0)
     lever = 0.14 * R[:, 2]  # sensor to grip point
     torque = m + np.cross(lever, f)  # at the sensor
-    raw = np.concatenate([R.T @ torque, R.T @ f]) + bias + gravity_wrench(R, GEOMETRY, LEFT)
-    assert contact_wrench(raw, bias, R, GEOMETRY, LEFT) == pytest.approx([*m, *f])
+    raw = np.concatenate([R.T @ torque, R.T @ f]) + bias + gravity_wrench(R, ROBOT.hands[LEFT])
+    assert contact_wrench(raw, bias, R, ROBOT.hands[LEFT]) == pytest.approx([*m, *f])
     # by hand: a hand that points ahead is pulled to the left with 10 N at its grip point: 1.4 N m at the sensor
-    level = GEOMETRY.arm_forward(np.zeros(6), LEFT)[:, :3]
-    raw = np.array([0, 1.4, 0, 10, 0, 0]) + gravity_wrench(level, GEOMETRY, LEFT)
-    assert contact_wrench(raw, np.zeros(6), level, GEOMETRY, LEFT) == pytest.approx([0, 0, 0, 0, 10, 0], abs=1e-12)
+    level = ROBOT.forward(LEFT, np.zeros(6))[:, :3]
+    raw = np.array([0, 1.4, 0, 10, 0, 0]) + gravity_wrench(level, ROBOT.hands[LEFT])
+    assert contact_wrench(raw, np.zeros(6), level, ROBOT.hands[LEFT]) == pytest.approx([0, 0, 0, 0, 10, 0], abs=1e-12)
 
 
 def test_tare_removes_the_bias():
@@ -618,7 +618,7 @@ def test_telemetry_by_hand():
     assert (t.torque, t.share_left) == (pytest.approx(3.0), pytest.approx(1.0))  # the left hand alone carries it
     assert t.stem_force.tolist() == [3, 2, 20]
     assert t.squeeze == pytest.approx(7.0)  # the bar pushes both hands outwards: they compress it
-    assert t.center == pytest.approx([0.6, 0, GEOMETRY.shoulder_height])  # in B
+    assert t.center == pytest.approx([0.6, 0, 0])  # in B
     assert t.force_left.tolist() == [1, 8, 20] and t.moment_right.tolist() == [0, 0.5, 0]
     assert law._telemetry(1.0, Memory(), chain_with()).share_left == 0.5
 
@@ -708,7 +708,7 @@ def test_the_same_inputs_give_the_same_bits():
 )
 def test_bad_config_is_refused_by_name(changes):
     with pytest.raises(ConfigError, match=f"hybrid_rotation.{next(iter(changes))}"):
-        HybridRotation(dc.replace(CONFIG, **changes), MARKER, GEOMETRY, VIEW)
+        HybridRotation(dc.replace(CONFIG, **changes), MARKER, ROBOT, VIEW)
 
 
 def rig(**inputs) -> Rig:

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
 from robot_facts import ARMS_HOME as HOME
+from robot_facts import LIMITS, ROBOT
 
 from valve_drake import resources
 from valve_drake.behaviors.grasp_geometry import (
     StanceConfig,
+    Stances,
     angle_turned,
-    find_stance,
     hand_in_valve,
     standoff,
     turned,
@@ -24,7 +25,6 @@ from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, inverse, make, planar, rotation, rotation_vector
-from valve_drake.kinematics import ARM_LIMITS, GEOMETRY, lateral
 from valve_drake.messages import (
     SIDES,
     Cause,
@@ -40,6 +40,7 @@ from valve_drake.messages import (
 )
 from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK
+from valve_drake.robot.kinematics import OUTWARD
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
 from valve_drake.supervisor.supervisor import SupervisorConfig
@@ -59,19 +60,19 @@ X_OV = compose(
 
 @pytest.fixture(scope="module")
 def collision():
-    return CollisionModel(MARKER)
+    return CollisionModel(ROBOT, MARKER)
 
 
 @pytest.fixture(scope="module")
 def base():
-    return find_stance(X_OV, QUARTER, GEOMETRY, MARKER, STANCE, VIEW)[0]
+    return Stances(ROBOT, MARKER, STANCE, VIEW, lambda X_BV, q: True).find(X_OV, QUARTER)[0]
 
 
 class Bench:
     """Arms that follow at once, a head camera that sees the marker with some noise 8 times a second."""
 
     def __init__(self, base: np.ndarray, is_free=lambda X_BV, q: True, *, arms: np.ndarray = HOME, config=CONFIG):
-        self.law = KinematicApproach(config, STANCE, MARKER, GEOMETRY, VIEW, AREA, is_free)
+        self.law = KinematicApproach(config, Stances(ROBOT, MARKER, STANCE, VIEW, is_free), AREA)
         self.base, self.X_OV, self.axis_known = base, X_OV, True
         self.rng = np.random.default_rng(0)
         self.noise = np.array([0.002] * 3 + [0.001] * 3)  # of an estimate [rad, m]
@@ -83,7 +84,7 @@ class Bench:
         self.commands: list[np.ndarray] = []
 
     def look(self) -> RectangleEstimate:
-        X_OL = GEOMETRY.head_pose(self.base, self.torso)
+        X_OL = ROBOT.head_pose(self.base, self.torso)
         X_LV = compose(inverse(X_OL), self.X_OV)
         e = self.rng.normal(size=6) * self.noise
         return RectangleEstimate(
@@ -144,7 +145,7 @@ def assert_smooth(commands: list[np.ndarray]) -> None:
     speed = np.diff(q, axis=0) / TICK
     assert np.abs(speed).max() <= CONFIG.joint_speed * (1 + 1e-9)
     assert np.abs(np.diff(speed, axis=0)).max() / TICK <= 1.01 * CONFIG.joint_acceleration
-    assert np.abs(q).max(axis=0) == pytest.approx(np.minimum(np.abs(q).max(axis=0), np.tile(ARM_LIMITS, 2)))
+    assert np.abs(q).max(axis=0) == pytest.approx(np.minimum(np.abs(q).max(axis=0), np.tile(LIMITS, 2)))
 
 
 # ---------------------------------------------------------------- at home
@@ -158,7 +159,7 @@ def test_where_it_has_nothing_else_to_do_the_arms_go_home_and_stay(base, mode):
     assert bench.commands[0] == pytest.approx(start, abs=1e-9)
     assert bench.arms == pytest.approx(HOME)
     assert_smooth([start, *bench.commands])
-    assert bench.command.left_gripper.tolist() == [CONFIG.opening, CONFIG.gripper_force]
+    assert bench.command.left_gripper.tolist() == [ROBOT.opening, CONFIG.gripper_force]
     assert bench.command.base_twist is None and bench.command.torso is None
     bench.run(mode, limit=0.1)
     assert np.ptp(bench.commands, axis=0).max() == 0
@@ -166,7 +167,7 @@ def test_where_it_has_nothing_else_to_do_the_arms_go_home_and_stay(base, mode):
 
 def test_home_mirrors_from_left_to_right(base):
     law = Bench(base).law
-    left, right = (GEOMETRY.arm_forward(law.home[6 * k : 6 * k + 6], side)[:, 3] for k, side in enumerate(SIDES))
+    left, right = (ROBOT.forward(side, law.home[6 * k : 6 * k + 6])[:, 3] for k, side in enumerate(SIDES))
     assert right == pytest.approx(left * [1, -1, 1])
 
 
@@ -299,9 +300,9 @@ def test_reaching_goes_free_and_smooth_to_the_standoff_and_rests_there(base, col
     plan = bench.memory.plan
     X_BV = compose(inverse(planar(*base)), X_OV)
     for k, side in enumerate(SIDES):
-        X_BG = compose(GEOMETRY.X_BH(), GEOMETRY.arm_forward(bench.arms[6 * k : 6 * k + 6], side))
+        X_BG = ROBOT.forward(side, bench.arms[6 * k : 6 * k + 6])
         goal = standoff(getattr(plan, f"X_BG_{side}"), VIEW[side], STANCE.standoff)
-        assert X_BG == pytest.approx(goal, abs=1e-9)
+        assert X_BG == pytest.approx(goal, abs=1e-6)
     assert_smooth([start, *bench.commands])
     for q in bench.commands[::4]:
         assert collision.is_free(X_BV, q), collision.touching(X_BV, q)
@@ -337,7 +338,8 @@ def test_one_large_mark_is_not_enough(base, left, right):
 
 
 def test_a_blocked_standoff_fails_with_a_verdict_and_the_arms_stay(base):
-    bench = Bench(base, lambda X_BV, q: bool(np.max(np.abs(q - HOME)) < 0.2)).measured()
+    bench = Bench(base).measured()
+    bench.law.stances = dc.replace(bench.law.stances, is_free=lambda X_BV, q: bool(np.max(np.abs(q - HOME)) < 0.2))
     status = bench.run(Mode.REACH)
     assert (status.state, status.verdict) == ("failed", "reach_limit")
     assert "no collision-free path" in status.detail
@@ -358,7 +360,7 @@ def test_a_way_round_an_obstacle_stays_within_the_joint_limits(base, detour):
     status = bench.run(Mode.REACH, limit=20)
     assert status.state == "succeeded", status.detail
     assert min(q[2] for q in bench.commands) <= HOME[2] - detour + 0.05  # it did go round
-    assert np.all(np.abs(bench.commands) <= np.tile(ARM_LIMITS, 2))
+    assert np.all(np.abs(bench.commands) <= np.tile(LIMITS, 2))
 
 
 # ---------------------------------------------------------------- verify
@@ -449,10 +451,10 @@ def test_where_the_straight_line_is_blocked_the_hands_move_straight_back_from_th
     assert len(vias) == 3
     for via, back in zip(vias, (0.10, 0.16, 0.22)):
         for k, side in enumerate(SIDES):
-            X0, X1 = (GEOMETRY.arm_forward(q[6 * k : 6 * k + 6], side) for q in (at_valve, via))
+            X0, X1 = (ROBOT.forward(side, q[6 * k : 6 * k + 6]) for q in (at_valve, via))
             moved = X1[:, 3] - X0[:, 3] + back * X0[:, 2]
-            assert moved == pytest.approx([0, lateral(side) * back / 2, 0])  # and a little outwards
-            assert X1[:, :3] == pytest.approx(X0[:, :3])
+            assert moved == pytest.approx([0, OUTWARD[side] * back / 2, 0], abs=2e-6)  # and a little outwards
+            assert X1[:, :3] == pytest.approx(X0[:, :3], abs=2e-6)
     middle = (start + goal) / 2
     bench.law.is_free = lambda X_BV, q: bool(np.abs(q - middle).max() > 0.08)
     bench.run(Mode.IDLE, limit=0.1)
@@ -525,7 +527,7 @@ def test_the_same_inputs_give_the_same_bits(base, collision):
     assert np.array(a.commands).tobytes() == np.array(b.commands).tobytes()
 
 
-@pytest.mark.parametrize("changes", [{"home": [0.0] * 5}, {"joint_speed": 0.0}, {"frames": 0}, {"rest": float("nan")}])
+@pytest.mark.parametrize("changes", [{"joint_speed": 0.0}, {"frames": 0}, {"rest": float("nan")}])
 def test_bad_config_is_refused_by_name(changes):
     with pytest.raises(ConfigError, match=f"kinematic_approach.{next(iter(changes))}"):
         Bench(np.zeros(3), config=dc.replace(CONFIG, **changes))

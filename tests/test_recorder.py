@@ -13,6 +13,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
+from robot_facts import ROBOT
 
 from valve_drake import frames, profiling, resources
 from valve_drake import messages as ms
@@ -293,7 +294,7 @@ def test_frames_poses_and_calibrations(log):
 
 def test_the_wheel_turns_with_the_marker_and_the_panel_stays():
     marker = Marker()
-    belief = RobotFrames(load_head(resources.models() / "calibration" / "head.yaml"), marker)
+    belief = RobotFrames(ROBOT, load_head(resources.models() / "calibration" / "head.yaml"), marker)
     X_BV = frames.make(frames.rot_y(0.2), np.array([0.6, 0.1, 1.2]))
     found = {}
     for angle in (0.0, 0.7):

@@ -5,12 +5,12 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
+from robot_facts import ROBOT
 
 from valve_drake import scenario as scenarios
 from valve_drake.camera.lens import Lens, OpenCvLens
 from valve_drake.diagram import initial_commands, make_station
 from valve_drake.frames import apply, compose, inverse, make, planar
-from valve_drake.kinematics import GEOMETRY
 from valve_drake.messages import SIDES
 from valve_drake.stations import camera_rig, contract, simulated
 from valve_drake.stations.scene import arm_joints, panel_pose, start_pose
@@ -101,9 +101,9 @@ def test_the_robot_stands_still_at_home(rig):
 
 def test_a_wrist_sensor_feels_the_hands_weight_downwards(rig):
     for side in SIDES:
-        R_HG = GEOMETRY.arm_forward(rig.read(f"{side}_arm.position_measured"), side)[:, :3]
-        force = R_HG @ rig.read(f"{side}_wrist.wrench")[3:]
-        np.testing.assert_allclose(force, [0, 0, -9.81 * GEOMETRY.hand_mass], atol=0.05)
+        R_BG = ROBOT.forward(side, rig.read(f"{side}_arm.position_measured"))[:, :3]
+        force = R_BG @ rig.read(f"{side}_wrist.wrench")[3:]
+        np.testing.assert_allclose(force, [0, 0, -9.81 * ROBOT.hands[side].mass], atol=0.05)
 
 
 def test_arms_follow_positions_and_report_torque():
@@ -200,7 +200,7 @@ def test_a_rendered_marker_lies_where_the_lens_says_to_a_twentieth_of_a_pixel(ca
     candidates, _ = segment(frame.image, ColorSegmentationConfig())
     quad = fit_quads([frame.image], [candidates[0].corners], LineFittingConfig())[0]
     base = rig.read("truth.base_pose")
-    X_WL = compose(planar(*base), GEOMETRY.X_BL(rig.read("torso.position_measured")))
+    X_WL = compose(planar(*base), ROBOT.X_BL(rig.read("torso.position_measured")))
     X_WC = X_WL if side == "left" else compose(X_WL, head.X_LR)
     X_CV = compose(inverse(X_WC), rig.read("truth.marker_pose").reshape(3, 4))
     lens = getattr(head, side)

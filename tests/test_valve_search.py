@@ -6,18 +6,18 @@ import itertools
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+from robot_facts import ROBOT
 
 from valve_drake.behaviors.valve_search import Memory, ValveSearchConfig, aim, step
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, inverse, make
-from valve_drake.kinematics import RobotGeometry
 from valve_drake.messages import Mode, ModeState, RectangleEstimate, RobotState, StereoPosition, Verdict
 from valve_drake.ports import TICK
 
 DT = 1 / 64  # half the real rate: the laws do not depend on it, and the tests are quicker
 CONFIG = ValveSearchConfig()
-HEAD = RobotGeometry().head_pose
+HEAD = ROBOT.head_pose
 VIEW = (np.deg2rad(14.5), np.deg2rad(11))  # half the field of the narrower camera
 BASELINE = 0.12
 

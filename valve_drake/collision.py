@@ -7,36 +7,33 @@ from pydrake.math import RigidTransform, RotationMatrix
 from valve_drake.frames import compose, make
 from valve_drake.messages import SIDES
 from valve_drake.perception.marker import Marker
-from valve_drake.stations.scene import model
+from valve_drake.robot.robot import Robot
 
 FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the valve's pose while none is known
 
 
 class CollisionModel:
-    """Robot at the base's origin with its waist at zero, and a valve that can be put anywhere.
+    """Robot at the base's origin with lift, waist and head at home, and a valve that can be put anywhere.
 
-    clearance: least distance that counts as free; a larger one forbids poses near the valve [m].
-    opening: of both grippers [m].
+    clearance: least distance that counts as free; a larger one forbids poses near the valve [m]; None: the robot's.
+    opening: of both grippers [m]; None: the robot's.
     """
 
-    def __init__(self, marker: Marker, clearance: float = 0.015, opening: float = 0.085):
-        self._model = shared = model()
+    def __init__(self, robot: Robot, marker: Marker, clearance: float | None = None, opening: float | None = None):
+        shared = robot.model
         self._plant, self._scene_graph, self._valve = shared.plant, shared.scene_graph, shared.valve
         self._root = shared.diagram.CreateDefaultContext()
         self._context = self._plant.GetMyMutableContextFromRoot(self._root)
-        self._clearance = clearance
+        self._clearance = robot.description.collision.padding if clearance is None else clearance
         self._panel_depth = marker.panel_depth
-        joint = self._plant.GetJointByName
-        self._arm = [joint(f"{side}_arm_{k}", shared.robot).position_start() for side in SIDES for k in range(1, 7)]
-        self._fingers = [joint(f"{side}_finger_{k}", shared.robot).position_start() for side in SIDES for k in (1, 2)]
-        self._opening = opening
+        self._arms = robot.slots([name for side in SIDES for name in robot.arms[side].names])
+        self._rest = robot.rest(robot.opening if opening is None else opening)
 
     def _pose(self, X_BV: np.ndarray | None, q: np.ndarray) -> QueryObject:
         """Poses the model and returns the geometry query for it."""
         plant, context = self._plant, self._context
-        positions = np.array(plant.GetPositions(context))
-        positions[self._arm] = q
-        positions[self._fingers] = self._opening / 2
+        positions = self._rest.copy()
+        positions[self._arms] = q
         plant.SetPositions(context, positions)
         X_BP = FAR if X_BV is None else compose(X_BV, make(np.eye(3), np.array([0, 0, self._panel_depth])))
         frame = plant.GetFrameByName("valve_axis", self._valve)
@@ -46,7 +43,7 @@ class CollisionModel:
         return self._scene_graph.get_query_output_port().Eval(self._scene_graph.GetMyContextFromRoot(self._root))
 
     def is_free(self, X_BV: np.ndarray | None, q: np.ndarray) -> bool:
-        """True if no two bodies are nearer than the clearance. X_BV: marker in the base, None: no valve; q (12,)."""
+        """True if no two bodies are nearer than the clearance. X_BV: marker in the base (None: no valve); q: arms."""
         return len(self._pose(X_BV, q).ComputeSignedDistancePairwiseClosestPoints(self._clearance)) == 0
 
     def touching(self, X_BV: np.ndarray | None, q: np.ndarray) -> list[str]:

@@ -37,6 +37,7 @@ class Rule:
     count: tuple[int, int] = (0, 100)  # of a list: least and most entries
     names: tuple[str, ...] = ()  # a group of keys has no others than these
     complete: bool = False  # and has all of them
+    any_name: bool = False  # a group of keys may have any name
 
     def bounds(self, place: int | str) -> tuple[float, float]:
         """Bounds of a list's entry or of a group's key (whichever it is, of a single number)."""
@@ -74,6 +75,16 @@ def texts(default: Mapping[str, str], about: str) -> Any:
     """Texts by name; the names are those of the default."""
     rule = Rule(about, names=tuple(default))
     return dc.field(default_factory=lambda: dict(default), metadata={_RULE: rule})
+
+
+def names(about: str, count: tuple[int, int]) -> Any:
+    """A list of texts, empty by default; count: least and most entries."""
+    return dc.field(default_factory=list, metadata={_RULE: Rule(about, count=count)})
+
+
+def named(about: str, low: Bound | None = None, high: Bound | None = None, count: tuple[int, int] = (0, 100)) -> Any:
+    """A group of keys of any name, empty by default; low, high, count: of what stands under each."""
+    return dc.field(default_factory=dict, metadata={_RULE: Rule(about, low, high, count=count, any_name=True)})
 
 
 def choice(default: str, options: Sequence[str], about: str) -> Any:
@@ -149,13 +160,19 @@ def _check(value: Any, kind: Any, rule: Rule, key: str) -> None:
     elif origin is dict:
         _check_names(value, rule, key)
         for name, item in value.items():
-            _check_item(item, arguments[1], rule, name, f"{key}.{name}")
+            inner = f"{key}.{name}"
+            if typing.get_origin(arguments[1]) is list:
+                _check(item, arguments[1], rule, inner)
+            else:
+                _check_item(item, arguments[1], rule, name, inner)
     else:
         _check_item(value, kind, rule, 0, key)
 
 
 def _check_names(value: Any, rule: Rule, key: str) -> None:
     require(isinstance(value, dict), key, "a group of keys", value)
+    if rule.any_name:
+        return
     unknown = [name for name in value if name not in rule.names]
     missing = [name for name in rule.names if name not in value] if rule.complete else []
     require(not unknown, key, f"given for {', '.join(rule.names)}", ", ".join(unknown))

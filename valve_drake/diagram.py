@@ -15,6 +15,7 @@ from pydrake.systems.primitives import Multiplexer
 
 from valve_drake import resources
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
+from valve_drake.behaviors.grasp_geometry import Stances
 from valve_drake.behaviors.hybrid_rotation import HybridRotation
 from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
 from valve_drake.behaviors.image_servo import ImageServo
@@ -24,11 +25,10 @@ from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSys
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import StereoHead, load_head
-from valve_drake.checks import ConfigError
+from valve_drake.checks import ConfigError, require
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, make
-from valve_drake.kinematics import GEOMETRY, both_arms
-from valve_drake.messages import SIDES, OperatorCommand
+from valve_drake.messages import SIDES, OperatorCommand, RobotState
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
 from valve_drake.perception.handle_marker_system import HandleMarkerSystem
 from valve_drake.perception.line_fitting_system import LineFittingSystem
@@ -37,6 +37,8 @@ from valve_drake.perception.stereo_positioning_system import StereoPositioningSy
 from valve_drake.ports import Block
 from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.recording.signals import JOINED
+from valve_drake.robot import description as descriptions
+from valve_drake.robot.robot import Robot
 from valve_drake.robot_state_system import RobotStateSystem
 from valve_drake.scenario import Scenario
 from valve_drake.stations.bus import Bus
@@ -103,18 +105,34 @@ class System:
     supervisor: SupervisorSystem
 
 
-def home(scenario: Scenario) -> np.ndarray:
-    """Both arms at home (12,)."""
-    return both_arms(np.array(scenario.kinematic_approach.home))
+def robot_of(scenario: Scenario) -> Robot:
+    """The robot of a scenario. Raises ConfigError if there is none, or the program cannot use it."""
+    robot = Robot.load(descriptions.find(scenario.robot))
+    d, sizes = robot.description, RobotState()
+    try:
+        for side in SIDES:
+            count, arm = len(getattr(sizes, f"{side}_arm")), d.arm(side).joints
+            require(len(arm) == count, f"arms.{side}.joints", f"{count} joints (no other arm is supported yet)", arm)
+        require(not d.lift.joints, "lift.joints", "none (a lift is not supported yet)", d.lift.joints)
+        require(bool(d.gaze.waist), "gaze.waist", "given (a robot without one is not supported yet)", d.gaze.waist)
+        require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
+        high, width = scenario.command_selector.gripper_high, scenario.marker.handle_width
+        require(d.opening <= high, "opening", f"at most command_selector.gripper_high, {high:g}", d.opening)
+        least = width + 2 * scenario.hybrid_rotation.grip_margin
+        require(d.opening >= least, "opening", f"at least {least:g}: marker.handle_width and room", d.opening)
+    except ConfigError as error:
+        raise ConfigError(f"{scenario.robot}: {error}") from error
+    return robot
 
 
 def initial_commands(scenario: Scenario) -> dict[str, np.ndarray]:
     """The values of the station's inputs before the first command, by port."""
-    arms = home(scenario)
+    robot = robot_of(scenario)
+    arms = robot.split(robot.home)
     out = {spec.name: np.zeros(spec.kind) for spec in CONTRACT if isinstance(spec.kind, int) and spec.direction == "in"}
-    for k, side in enumerate(SIDES):
-        out[f"{side}_arm.position_command"] = arms[6 * k : 6 * k + 6]
-        out[f"{side}_gripper.position_command"] = np.array([scenario.kinematic_approach.opening])
+    for side in SIDES:
+        out[f"{side}_arm.position_command"] = arms[side]
+        out[f"{side}_gripper.position_command"] = np.array([robot.opening])
         out[f"{side}_gripper.force_limit"] = np.array([scenario.kinematic_approach.gripper_force])
     return out
 
@@ -133,22 +151,24 @@ def make_station(
         if recording is None:
             raise ConfigError("station replay needs a log: valve-drake replay LOG")
         return make_replay_station(recording)
+    robot = robot_of(scenario)
     return make_simulated_station(
         scenario.simulation,
         (scenario.marker.size[0], scenario.marker.size[1]),
         _head(scenario),
-        home(scenario),
-        scenario.kinematic_approach.opening,
+        robot.home,
+        robot.opening,
         scenario.seed,
         meshcat,
         workers,
+        robot.description,
     )
 
 
 def rig_of(scenario: Scenario) -> tuple[Any, ...]:
     """The simulated cameras of a resolved scenario, as the arguments of CameraRig or CameraWorkers."""
     size = (scenario.marker.size[0], scenario.marker.size[1])
-    return rig_arguments(scenario.simulation, size, _head(scenario), scenario.seed)
+    return rig_arguments(scenario.simulation, size, _head(scenario), scenario.seed, robot_of(scenario).description)
 
 
 def _head(scenario: Scenario) -> StereoHead:
@@ -163,24 +183,24 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     view = {side: taught[side].view for side in SIDES}
     area = {side: taught[side].area for side in SIDES}
     X_LEyes = make(np.eye(3), head.X_LR[:, 3] / 2)  # between both head cameras: a near marker stays in both images
-    collision = CollisionModel(marker, opening=scenario.kinematic_approach.opening)
+    robot = robot_of(scenario)
+    collision = CollisionModel(robot, marker)
+    if touching := collision.touching(None, robot.home):
+        raise ConfigError(f"{scenario.robot}: arms.left.home and arms.right.home must be free of all: {touching[0]}")
+    stances = Stances(robot, marker, scenario.stance, view, collision.is_free)
     return [
         RobotStateSystem(),
         ColorSegmentationSystem(scenario.color_segmentation),
         LineFittingSystem(scenario.line_fitting, head, marker, scenario.stereo_positioning),
-        StereoPositioningSystem(scenario.stereo_positioning, head, GEOMETRY.head_pose, marker),
-        RectangleEstimatorSystem(scenario.rectangle_estimator, head, GEOMETRY.head_pose, marker),
+        StereoPositioningSystem(scenario.stereo_positioning, head, robot.head_pose, marker),
+        RectangleEstimatorSystem(scenario.rectangle_estimator, head, robot.head_pose, marker),
         HandleMarkerSystem(scenario.handle_marker),
-        ValveSearchSystem(scenario.valve_search, lambda base, torso: compose(GEOMETRY.head_pose(base, torso), X_LEyes)),
+        ValveSearchSystem(scenario.valve_search, lambda base, torso: compose(robot.head_pose(base, torso), X_LEyes)),
         BaseApproachSystem(scenario.base_approach, marker),
-        KinematicApproachSystem(
-            KinematicApproach(
-                scenario.kinematic_approach, scenario.stance, marker, GEOMETRY, view, area, collision.is_free
-            )
-        ),
-        ImageServoSystem(ImageServo(scenario.image_servo, GEOMETRY, taught)),
-        HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, marker, GEOMETRY, view)),
-        CommandSelectorSystem(scenario.command_selector, initial_commands(scenario)),
+        KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, stances, area)),
+        ImageServoSystem(ImageServo(scenario.image_servo, robot, taught)),
+        HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, marker, robot, view)),
+        CommandSelectorSystem(scenario.command_selector, initial_commands(scenario), robot.arms),
         SupervisorSystem(scenario.supervisor),
     ]
 

@@ -26,7 +26,7 @@ from valve_drake.behaviors.taught import load_taught
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError, OperationFailed, require
 from valve_drake.config import key_names
-from valve_drake.diagram import System, command, make_diagram, rig_of
+from valve_drake.diagram import System, command, make_diagram, rig_of, robot_of
 from valve_drake.messages import Mode, ModeState, OperatorCommand, Verdict
 from valve_drake.pace import PACE, Pace, Pacer
 from valve_drake.player import Player
@@ -38,6 +38,8 @@ from valve_drake.recording.recorder_system import RecorderSystem, Sink, Tee
 from valve_drake.recording.robot_frames import RobotFrames, pinholes
 from valve_drake.recording.signals import signals
 from valve_drake.recording.writer import LogError, LogWriter
+from valve_drake.robot import description as descriptions
+from valve_drake.robot.robot import Robot
 from valve_drake.scenario import (
     RETIRED,
     TAGS,
@@ -59,7 +61,12 @@ from valve_drake.versions import versions
 STEP = 1 / 32  # between two looks at the mode [s]
 TAIL = 1.5  # recorded after the end: a stopped base takes a second to stand [s]
 VIEW_PORT = 7000  # that Drake's 3D view tries first
-READERS = {"head_calibration": load_head, "taught": load_taught}  # of the files that a scenario names
+# Of the files that a scenario names: what reads one, and raises ConfigError.
+READERS: dict[str, Callable[[Path], object]] = {
+    "robot": Robot.load,
+    "head_calibration": load_head,
+    "taught": load_taught,
+}
 FILES = {key: f"{key}.yaml" for key in READERS}  # the same, as attached to its log
 WORLD = ("simulation", "hardware", "faults")
 RECORDED = ("seed", "station", "command", "angle", "time_limit", *WORLD)  # keys that a replay cannot change
@@ -119,7 +126,7 @@ class Result:
 def make_recorder(sink: Sink, scenario: Scenario) -> RecorderSystem:
     """The recorder with all topics of the program."""
     head = load_head(resources.find(scenario.head_calibration, resources.models()))
-    frames = RobotFrames(head, scenario.marker)
+    frames = RobotFrames(robot_of(scenario), head, scenario.marker)
     return RecorderSystem(sink, signals(frames, frames.scene, pinholes(head)))
 
 
@@ -235,9 +242,9 @@ def _read_files(scenario: Scenario) -> dict[str, bytes]:
     what it should be: nothing else of a user's files gets into a log."""
     files = {}
     for key, load in READERS.items():
-        path = resources.find(getattr(scenario, key), resources.models())
+        path = descriptions.find(getattr(scenario, key))
         load(path)
-        files[FILES[key]] = path.read_bytes()
+        files[FILES[key]] = descriptions.text(path) if key == "robot" else path.read_bytes()
     return files
 
 

@@ -45,6 +45,10 @@ RETIRED = (
     "color_segmentation.every",
     "handle_marker.every",
     "handle_marker.lines.single_camera",
+    "hybrid_rotation.opening",
+    "image_servo.opening",
+    "kinematic_approach.home",
+    "kinematic_approach.opening",
     *(
         f"handle_marker.segmentation.{name}"
         for name in ("min_opponent", "min_green_area", "min_fill", "border", "follow", "full_every", "every")
@@ -62,6 +66,7 @@ class Scenario(Config):
     command: str = choice("open", ("open", "close"), "what to do with the valve")
     angle: float = number(1.5707963267948966, 0.01, 6.29, "to turn [rad]")
     time_limit: float = number(240.0, 0.1, 3600.0, "of the whole run [s]")
+    robot: str = plain("robot/robot.yaml", "a path, one below models/, or a package:// URL")
     head_calibration: str = plain("calibration/head.yaml", "a path, or one below models/")
     taught: str = plain("taught/hands.yaml", "a path, or one below models/")
     marker: Marker = dc.field(default_factory=Marker)
@@ -93,15 +98,7 @@ class Scenario(Config):
         """What the blocks have to agree on."""
         limit = self.supervisor.angle_limit
         require(self.angle <= limit, "angle", f"at most supervisor.angle_limit, {limit:g}", self.angle)
-        # The collision model and the start of a run know one opening of the hands, and the selector clips all.
-        selector, opening = self.command_selector, self.kinematic_approach.opening
-        high = selector.gripper_high
-        require(
-            opening <= high, "kinematic_approach.opening", f"at most command_selector.gripper_high, {high:g}", opening
-        )
-        for name in ("image_servo", "hybrid_rotation"):
-            value = getattr(self, name).opening
-            require(value == opening, f"{name}.opening", f"that of kinematic_approach, {opening:g}", value)
+        selector = self.command_selector
         for name in ("kinematic_approach.gripper_force", "image_servo.gripper_force", "hybrid_rotation.grip_force",
                      "hybrid_rotation.open_force"):  # fmt: skip
             block, _, force = name.partition(".")

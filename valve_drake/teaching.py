@@ -10,13 +10,14 @@ import cv2
 import numpy as np
 
 from valve_drake import outputs, resources
-from valve_drake.behaviors.grasp_geometry import StanceConfig, best_arc, hand_in_valve
+from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances, hand_in_valve
 from valve_drake.behaviors.taught import TaughtReference, save_taught
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError
+from valve_drake.collision import CollisionModel
+from valve_drake.diagram import robot_of
 from valve_drake.frames import compose, inverse, make, planar
-from valve_drake.kinematics import GEOMETRY
-from valve_drake.messages import LEFT, RIGHT, SIDES
+from valve_drake.messages import SIDES
 from valve_drake.perception.handle_marker import find_mark
 from valve_drake.scenario import Scenario, resolve
 from valve_drake.stations.camera_rig import CameraRig, Capture
@@ -39,28 +40,31 @@ def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.
     valve = simulation.valve
     marker = scenario.marker
     head = load_head(resources.find(scenario.head_calibration, resources.models()))
+    robot = robot_of(scenario)
     mounts = make_mounts(head, simulation, scenario.seed)
-    rig = CameraRig(mounts, valve, (marker.size[0], marker.size[1]), simulation.light, simulation.camera, scenario.seed)
+    size = (marker.size[0], marker.size[1])
+    rig = CameraRig(mounts, valve, size, simulation.light, simulation.camera, scenario.seed, robot.description)
     X_WV = compose(panel_pose(valve), make(np.eye(3), np.array([0, 0, -marker.panel_depth])))
     base = start_pose(simulation.start, valve)
     X_BV = compose(inverse(planar(*base)), X_WV)
     straight = {side: np.array([0.0, 0.0, 1.0]) for side in SIDES}  # the view direction is not known yet
-    arc = best_arc(X_BV, np.pi / 2, GEOMETRY, marker, StanceConfig(), straight)
-    if arc.margin < 0 or arc.q_left is None or arc.q_right is None:
+    is_free = CollisionModel(robot, marker).is_free
+    arc = Stances(robot, marker, StanceConfig(), straight, is_free).best_arc(X_BV, np.pi / 2)
+    if arc.margin < 0:
         raise ConfigError("teach: the hands do not reach the handles")
-    q0 = {LEFT: arc.q_left, RIGHT: arc.q_right}
+    q0 = dict(arc.q)
     taught, pictures = {}, {}
     for side in SIDES:
-        X_HG = compose(inverse(GEOMETRY.X_BH()), X_BV, hand_in_valve(side, arc.swapped, marker))
+        X_BG = compose(X_BV, hand_in_valve(side, arc.swapped, marker))
 
         def look(
-            offset: np.ndarray, side: str = side, X_HG: np.ndarray = X_HG
+            offset: np.ndarray, side: str = side, X_BG: np.ndarray = X_BG
         ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-            moved = make(X_HG[:, :3], X_HG[:, 3] + X_HG[:, :3] @ offset)
-            q = GEOMETRY.arm_inverse(moved, side, q0[side])
+            moved = make(X_BG[:, :3], X_BG[:, 3] + X_BG[:, :3] @ offset)
+            q = robot.inverse(side, moved, q0[side])
             if q is None:
                 raise ConfigError(f"teach: the {side} hand does not reach a probe at {offset} m")
-            positions = _positions(rig, base, q0 | {side: q}, scenario.kinematic_approach.opening)
+            positions = _positions(rig, base, q0 | {side: q}, robot.opening)
             frames = [rig.frame(f"{side}_wrist", Capture(0.0, k, positions)) for k in range(IMAGES)]
             marks = [find_mark(frame.image, scenario.handle_marker) for frame in frames]
             if not all(mark.found for mark in marks):

@@ -7,17 +7,19 @@ and the *nominal* head: an error of the head's mount counts as an error of the e
 import dataclasses as dc
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from valve_drake.checks import ConfigError
-from valve_drake.frames import compose, inverse, make, planar, rot_z, rotation_vector, wrap
-from valve_drake.kinematics import GEOMETRY
+from valve_drake.frames import compose, inverse, make, rot_z, rotation_vector, wrap
 from valve_drake.messages import SIDES, Mode
 from valve_drake.recording.reader import LogReader, Record
 from valve_drake.recording.signals import TORSO
 from valve_drake.recording.tables import Table
+
+if TYPE_CHECKING:
+    from valve_drake.robot.robot import Robot
 
 ARMS = {side: tuple(f"{side}_arm_{k}" for k in range(1, 7)) for side in SIDES}
 SCHEMAS = {  # of the topics that are read here
@@ -197,6 +199,18 @@ class Traces:
         return Joints(time, names, position, velocity, commanded)
 
     @_Trace
+    def robot(self) -> "Robot | None":
+        """The robot that the log holds; our own where it holds none."""
+        from valve_drake.robot import description
+        from valve_drake.robot.robot import Robot
+
+        kept = self.reader.attachments.get("robot.yaml")
+        if kept is None:
+            return Robot.load(description.find(description.OURS))
+        source = f"{self.reader.path}: robot.yaml"
+        return Robot.of(description.parse(kept.data.decode(), source, self.reader.path), source)
+
+    @_Trace
     def truth(self) -> Truth | None:
         topics = ("/truth/base_pose", "/truth/marker_pose", "/truth/valve_angle")
         tables = [table for topic in topics if (table := self._table(topic)) is not None]
@@ -237,7 +251,9 @@ class Traces:
         base = interpolate(time, truth.time, truth.base)
         marker = interpolate(time, truth.time, truth.X_WV)
         torso = interpolate(time, joints.time, joints.position[:, joints.index(TORSO)])
-        heads = (compose(planar(*b), GEOMETRY.X_BL(q)) for b, q in zip(base, torso))
+        if self.robot is None:
+            return None
+        heads = (self.robot.head_pose(b, q) for b, q in zip(base, torso))
         return np.array([compose(inverse(X_WL), X_WV) for X_WL, X_WV in zip(heads, marker)]).reshape(-1, 3, 4)
 
     def _errors(self, time: np.ndarray, X_LV: np.ndarray) -> np.ndarray:
@@ -302,11 +318,12 @@ class Traces:
         out = {"time": np.array([t for t, _ in rows])}
         for side in SIDES:
             out[f"{side}_error"] = np.array([np.linalg.norm(getattr(m, f"{side}_error")) for _, m in rows])
-            if self.joints is not None and len(self.joints.index(ARMS[side])) == 6:
+            robot = self.robot
+            if self.joints is not None and robot is not None and len(self.joints.index(ARMS[side])) == len(ARMS[side]):
                 at = self.joints.index(ARMS[side])
                 q = interpolate(out["time"], self.joints.time, self.joints.position[:, at])
                 v = interpolate(out["time"], self.joints.time, self.joints.velocity[:, at])
-                J = (GEOMETRY.arm_jacobian(row, side)[3:] for row in q)
+                J = (robot.jacobian(side, row)[3:] for row in q)
                 out[f"{side}_speed"] = np.array([np.linalg.norm(j @ row) for j, row in zip(J, v)])
         return out
 

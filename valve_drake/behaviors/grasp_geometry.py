@@ -5,15 +5,16 @@ turns, since V turns with it. Turning by theta (positive opens, about -z of V): 
 """
 
 import dataclasses as dc
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from valve_drake.checks import require
 from valve_drake.config import Config, number
 from valve_drake.frames import compose, inverse, make, planar, rot_z
-from valve_drake.kinematics import RobotGeometry, lateral
-from valve_drake.messages import SIDES
+from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.perception.marker import Marker
+from valve_drake.robot.kinematics import OUTWARD, RobotKinematics
 
 MAX_PLACES = 40  # distances of one search for a stance: it must end while the robot waits
 
@@ -58,7 +59,7 @@ def angle_turned(X_AV0: np.ndarray, X_AV1: np.ndarray) -> float:
 
 def hand_in_valve(side: str, swapped: bool, marker: Marker) -> np.ndarray:
     """X_VG of a hand on its handle -> (3, 4). z_G into the panel, x_G along the bar, towards the left hand's end."""
-    s = lateral(side) * (-1.0 if swapped else 1.0)
+    s = OUTWARD[side] * (-1.0 if swapped else 1.0)
     R = np.eye(3) if swapped else np.diag([-1.0, -1.0, 1.0])
     return make(R, np.array([-s * marker.handle_radius, 0, marker.handle_depth]))
 
@@ -71,90 +72,107 @@ def standoff(X_AG: np.ndarray, view_G: np.ndarray, distance: float) -> np.ndarra
 
 @dc.dataclass(frozen=True)
 class ArcCheck:
-    """Both arms along a turn: the least margin over it, and the joint angles at its start."""
+    """Both arms along a turn: the least margin over it, and each arm's joint angles at its start."""
 
     margin: float
     swapped: bool
-    q_left: np.ndarray | None = None
-    q_right: np.ndarray | None = None
+    q: Mapping[str, np.ndarray] = dc.field(default_factory=dict)  # side -> (n,); empty if the turn is out of reach
 
 
-def check_arc(
-    X_BV: np.ndarray,
-    turn_angle: float,
-    swapped: bool,
-    geometry: RobotGeometry,
-    marker: Marker,
-    config: StanceConfig,
-    view: dict[str, np.ndarray],
-) -> ArcCheck:
-    """Whether both hands can hold their handles all along the turn, and draw back from them at both ends.
+JUMP = 1.0  # a joint that moves so far between two angles of the turn is on another branch [rad]
 
-    X_BV: marker in the base, waist at zero. view: each wrist camera's view direction in its hand's frame.
+
+@dc.dataclass(frozen=True, eq=False)
+class Stances:
+    """Which turns the hands can follow, and from where.
+
+    view: each wrist camera's view direction in its hand's frame (from the taught reference).
+    is_free(X_BV, q): no contact and enough clearance with both arms at q, the valve at X_BV (None: no valve).
     """
-    X_HV = compose(inverse(geometry.X_BH()), X_BV)
-    count = max(2, int(np.ceil(abs(turn_angle) / config.arc_step)) + 1)
-    angles = np.linspace(0.0, turn_angle, count)
-    margin = 1.0
-    first: dict[str, np.ndarray] = {}
-    for side in SIDES:
-        X_VG = hand_in_valve(side, swapped, marker)
-        q_last = None
-        for k, angle in enumerate(angles):
-            X_HG = compose(turned(X_HV, angle), X_VG)
-            q = geometry.arm_inverse(X_HG, side, q_last)
-            if q is None or (q_last is not None and np.max(np.abs(q - q_last)) > 1.0):
-                return ArcCheck(-1.0, swapped)  # out of reach, or a jump to another branch
-            margin = min(margin, geometry.arm_margin(q))
-            if k in (0, count - 1):
-                back = geometry.arm_inverse(standoff(X_HG, view[side], config.standoff), side, q)
-                if back is None:
-                    return ArcCheck(-1.0, swapped)
-                margin = min(margin, geometry.arm_margin(back))
-            first.setdefault(side, q)
-            q_last = q
-            if margin <= 0:
-                return ArcCheck(margin, swapped)
-    return ArcCheck(margin, swapped, first["left"], first["right"])
 
+    robot: RobotKinematics
+    marker: Marker
+    config: StanceConfig
+    view: Mapping[str, np.ndarray]
+    is_free: Callable[[np.ndarray | None, np.ndarray], bool]
 
-def best_arc(
-    X_BV: np.ndarray,
-    turn_angle: float,
-    geometry: RobotGeometry,
-    marker: Marker,
-    config: StanceConfig,
-    view: dict[str, np.ndarray],
-) -> ArcCheck:
-    """The better of the two assignments of the handles to the hands, by its margin."""
-    arcs = [check_arc(X_BV, turn_angle, swapped, geometry, marker, config, view) for swapped in (False, True)]
-    return max(arcs, key=lambda arc: arc.margin)
+    def check_arc(
+        self, X_BV: np.ndarray, turn_angle: float, swapped: bool, near: Mapping[str, np.ndarray] | None = None
+    ) -> ArcCheck:
+        """Whether both hands can hold their handles all along the turn, and draw back from them at both ends.
 
+        X_BV: marker in the base, lift and waist at home. near: joints of a like arc's start, by side.
+        The arms are free of all at the turn's start, middle and end, or the margin is -1.
+        """
+        robot, out = self.robot, ArcCheck(-1.0, swapped)
+        count = max(2, int(np.ceil(abs(turn_angle) / self.config.arc_step)) + 1)
+        angles = np.linspace(0.0, turn_angle, count)
+        margin = 1.0
+        arcs: dict[str, list[np.ndarray]] = {side: [] for side in SIDES}
+        for side in SIDES:
+            X_VG = hand_in_valve(side, swapped, self.marker)
+            q_last = near.get(side) if near else None
+            for k, angle in enumerate(angles):
+                X_BG = compose(turned(X_BV, angle), X_VG)
+                q = robot.inverse(side, X_BG, q_last)
+                if q is None and k == 0 and q_last is not None:
+                    q = robot.inverse(side, X_BG)
+                if q is None or (k > 0 and q_last is not None and np.max(np.abs(q - q_last)) > JUMP):
+                    return out
+                margin = min(margin, robot.margin(side, q))
+                if k in (0, count - 1):
+                    back = robot.inverse(side, standoff(X_BG, self.view[side], self.config.standoff), q)
+                    if back is None:
+                        return out
+                    margin = min(margin, robot.margin(side, back))
+                if margin <= 0:
+                    return ArcCheck(margin, swapped)
+                arcs[side].append(q)
+                q_last = q
+        for k in (0, count // 2, count - 1):
+            q_both = np.concatenate([arcs[side][k] for side in SIDES])
+            if not self.is_free(turned(X_BV, angles[k]), q_both):
+                return out
+        return ArcCheck(margin, swapped, {side: arcs[side][0] for side in SIDES})
 
-def find_stance(
-    X_OV: np.ndarray,
-    turn_angle: float,
-    geometry: RobotGeometry,
-    marker: Marker,
-    config: StanceConfig,
-    view: dict[str, np.ndarray],
-) -> tuple[np.ndarray, float]:
-    """The nearest base pose (x, y, heading) in O, square to the panel, with a comfortable arm margin over the whole
-    turn; if there is none, the one with the largest margin.
+    def best_arc(self, X_BV: np.ndarray, turn_angle: float, near: ArcCheck | None = None) -> ArcCheck:
+        """The assignment of the handles to the hands with which the arms do not cross; where that does not serve, the
+        better of the two by its margin. near: a like arc, to start from."""
+        middle = turned(X_BV, turn_angle / 2)
+        left = {
+            swapped: compose(middle, hand_in_valve(LEFT, swapped, self.marker))[1, 3]
+            - compose(middle, hand_in_valve(RIGHT, swapped, self.marker))[1, 3]
+            for swapped in (False, True)
+        }
+        orders = sorted(left, key=lambda swapped: -left[swapped])  # left hand on the left first
+        best = ArcCheck(-1.0, orders[0])
+        for swapped in orders:
+            start = near.q if near is not None and near.swapped == swapped else None
+            arc = self.check_arc(X_BV, turn_angle, swapped, start)
+            if arc.margin > best.margin:
+                best = arc
+            if best.margin >= self.config.margin_min:
+                break
+        return best
 
-    Returns (base (3,), margin); margin < 0 if there is no stance from which the hands reach.
-    """
-    heading = float(np.arctan2(X_OV[1, 2], X_OV[0, 2]))  # of z_V, into the panel, on the floor
-    forward = np.array([np.cos(heading), np.sin(heading)])
-    axis_point = X_OV[:, 3] + marker.panel_depth * X_OV[:, 2]  # the stem at the panel
-    best, margin = np.zeros(3), -1.0
-    for distance in np.arange(config.distance_min, config.distance_max + 1e-9, config.distance_step):
-        xy = axis_point[:2] - distance * forward
-        base = np.array([xy[0], xy[1], heading])
-        X_BV = compose(inverse(planar(*base)), X_OV)
-        arc = best_arc(X_BV, turn_angle, geometry, marker, config, view)
-        if arc.margin > margin:
-            best, margin = base, arc.margin
-        if margin >= config.margin_enough:
-            break
-    return best, margin
+    def find(self, X_OV: np.ndarray, turn_angle: float) -> tuple[np.ndarray, float]:
+        """The nearest base pose (x, y, heading) in O, square to the panel, with a comfortable arm margin over the whole
+        turn; if there is none, the one with the largest margin.
+
+        Returns (base (3,), margin); margin < 0 if there is no stance from which the hands reach.
+        """
+        heading = float(np.arctan2(X_OV[1, 2], X_OV[0, 2]))  # of z_V, into the panel, on the floor
+        forward = np.array([np.cos(heading), np.sin(heading)])
+        axis_point = X_OV[:, 3] + self.marker.panel_depth * X_OV[:, 2]  # the stem at the panel
+        best, margin = np.zeros(3), -1.0
+        arc: ArcCheck | None = None
+        c = self.config
+        for distance in np.arange(c.distance_min, c.distance_max + 1e-9, c.distance_step):
+            xy = axis_point[:2] - distance * forward
+            base = np.array([xy[0], xy[1], heading])
+            arc = self.best_arc(compose(inverse(planar(*base)), X_OV), turn_angle, arc)
+            if arc.margin > margin:
+                best, margin = base, arc.margin
+            if margin >= c.margin_enough:
+                break
+        return best, margin

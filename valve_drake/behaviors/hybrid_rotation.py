@@ -18,7 +18,7 @@ There is no integrator on the turn: the rate is scaled down as the torque nears 
 turn yields as all other directions do, so a stuck valve stores no energy. The joints get positions only: feeding the
 admittance's velocity forward makes the loop oscillate.
 
-All vectors are in the chest frame H, which stands still while the hands are on the valve.
+All vectors are in the base's frame B, which stands still while the hands are on the valve, as lift and waist do.
 """
 
 import copy
@@ -31,7 +31,6 @@ from valve_drake.behaviors.grasp_geometry import standoff
 from valve_drake.checks import require
 from valve_drake.config import Config, number
 from valve_drake.frames import cross, make, rotation, wrap
-from valve_drake.kinematics import RobotGeometry
 from valve_drake.memory import changed
 from valve_drake.messages import (
     LEFT,
@@ -47,6 +46,7 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.perception.marker import Marker
+from valve_drake.robot.kinematics import HandLoad, RobotKinematics
 from valve_drake.task.modes import owned
 
 GRAVITY = 9.81
@@ -92,7 +92,6 @@ class HybridRotationConfig(Config):
     relax: float = number(
         0.6, 0.05, 10.0, "the hands yield for this long before they open, until the forces have decayed [s]"
     )
-    opening: float = number(0.085, 0.03, 0.09, "of the gripper [m]")
     open_force: float = number(40.0, 5.0, 100.0, "of the finger actuator while opening [N]")
     retreat: float = number(0.12, 0.02, 0.3, "hands drawn back after opening [m]")
     retreat_speed: float = number(0.10, 0.01, 0.3, "[m/s]")
@@ -105,29 +104,27 @@ class HybridRotationConfig(Config):
         require(gentle, f"{key}.tug_speed", f"at most force_trip / damping, {highest:.3g}", self.tug_speed)
 
 
-def gravity_wrench(R_HG: np.ndarray, geometry: RobotGeometry, side: str) -> np.ndarray:
+def gravity_wrench(R_BG: np.ndarray, hand: HandLoad) -> np.ndarray:
     """The load of the hand's own weight on the wrist sensor, in its frame -> [torque; force] (6,)."""
-    force = R_HG.T @ np.array([0.0, 0.0, -GRAVITY * geometry.hand_mass])
-    p = np.array(geometry.p_SHand) * (1.0 if side == LEFT else np.array([-1.0, 1, 1]))
-    return np.concatenate([cross(p, force), force])
+    R_SB = hand.X_SG[:, :3] @ R_BG.T
+    force = R_SB @ np.array([0.0, 0.0, -GRAVITY * hand.mass])
+    return np.concatenate([cross(hand.p_SCom, force), force])
 
 
-def contact_wrench(
-    raw: np.ndarray, bias: np.ndarray, R_HG: np.ndarray, geometry: RobotGeometry, side: str
-) -> np.ndarray:
-    """The external load on the hand at its grip point, in H: the reading `raw` without bias and weight.
+def contact_wrench(raw: np.ndarray, bias: np.ndarray, R_BG: np.ndarray, hand: HandLoad) -> np.ndarray:
+    """The external load on the hand at its grip point, in B: the reading `raw` without bias and weight.
 
     raw, bias: in the sensor's frame (6,). -> [torque; force] (6,).
     """
-    load = raw - bias - gravity_wrench(R_HG, geometry, side)
-    p_SG = np.array([0.0, 0.0, geometry.grip_behind])
-    torque = load[:3] - cross(p_SG, load[3:])
-    return np.concatenate([R_HG @ torque, R_HG @ load[3:]])
+    load = raw - bias - gravity_wrench(R_BG, hand)
+    torque = load[:3] - cross(hand.X_SG[:, 3], load[3:])
+    R_BS = R_BG @ hand.X_SG[:, :3].T
+    return np.concatenate([R_BS @ torque, R_BS @ load[3:]])
 
 
 @dc.dataclass(frozen=True)
 class Chain:
-    """The closed chain at one instant, measured (all in H)."""
+    """The closed chain at one instant, measured (all in B)."""
 
     p: np.ndarray  # grip points (2, 3), left first
     f: np.ndarray  # forces felt (2, 3) [N]
@@ -212,11 +209,11 @@ class Memory:
     since: float = 0.0  # of the stage [s]
     bias: np.ndarray = dc.field(default_factory=lambda: np.zeros((2, 6)))
     tared: bool = False
-    wrenches: np.ndarray = dc.field(default_factory=lambda: np.zeros((2, 6)))  # filtered, at the grip points, in H
+    wrenches: np.ndarray = dc.field(default_factory=lambda: np.zeros((2, 6)))  # filtered, at the grip points, in B
     commanding: bool = False  # X and q hold this block's own commands; not while other blocks move the hands
-    X: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # commanded X_HG
+    X: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # commanded X_BG
     q: Pair = dc.field(default_factory=lambda: _pair(6))  # commanded joints
-    start: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # X_HG at the stage's beginning
+    start: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # X_BG at the stage's beginning
     b0: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # direction of the bar at the grasp
     turned: float = 0.0  # by the hands since the grasp, unwrapped [rad]
     commanded: float = 0.0
@@ -239,13 +236,13 @@ class HybridRotation:
         self,
         config: HybridRotationConfig,
         marker: Marker,
-        geometry: RobotGeometry,
+        robot: RobotKinematics,
         view: dict[str, np.ndarray],
     ):
         config.check()
         self.config = copy.copy(config)
         self.marker = copy.copy(marker)
-        self.geometry = geometry
+        self.robot = robot
         self.view = view
 
     def step(
@@ -256,12 +253,12 @@ class HybridRotation:
             idle = memory if memory.activation < 0 else changed(memory, activation=-1, status=Status())
             return idle, Command(time=time)
         q = (state.left_arm, state.right_arm)
-        X = (self.geometry.arm_forward(q[0], LEFT), self.geometry.arm_forward(q[1], RIGHT))
+        X = (self.robot.forward(LEFT, q[0]), self.robot.forward(RIGHT, q[1]))
         m = self._sense(dt, memory, state, mode, X)
         if mode.mode in (Mode.REACH, Mode.SERVO):  # other blocks move the hands
             return changed(m, activation=-1, status=Status(), commanding=False), Command(time=time)
         p = np.array([X[0][:, 3], X[1][:, 3]])
-        u = -plan.X_BV[:, 2]  # H and B have the same axes while the waist is at zero
+        u = -plan.X_BV[:, 2]
         chain = make_chain(p, m.wrenches, u)
         if mode.activation != m.activation:
             m = self._begin(time, m, mode, X, q, chain)
@@ -286,12 +283,14 @@ class HybridRotation:
             speeds = (*state.left_arm_velocity.tolist(), *state.right_arm_velocity.tolist())
             if not all(abs(speed) < 0.02 for speed in speeds) or not np.isfinite(raw).all():
                 return changed(m, tared=False) if m.tared else m
-            load = np.array([raw[k] - gravity_wrench(X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)])
+            load = np.array(
+                [raw[k] - gravity_wrench(X[k][:, :3], self.robot.hands[side]) for k, side in enumerate(SIDES)]
+            )
             a = 1 - np.exp(-dt / self.config.tare_time)
             bias = m.bias + a * (load - m.bias) if m.tared else load
             return changed(m, bias=bias, tared=True, wrenches=np.zeros((2, 6)))
         now = np.array(
-            [contact_wrench(raw[k], m.bias[k], X[k][:, :3], self.geometry, side) for k, side in enumerate(SIDES)]
+            [contact_wrench(raw[k], m.bias[k], X[k][:, :3], self.robot.hands[side]) for k, side in enumerate(SIDES)]
         )
         a = 1 - np.exp(-2 * np.pi * self.config.filter * dt)
         last = np.where(
@@ -447,7 +446,7 @@ class HybridRotation:
         if m.bad_grip_time > 0.5:
             detail = f"{self._openings(state)}, left hand carries {100 * share:.0f} %"
             return self._fail(time, m, Verdict.SLIP, detail)
-        if min(self.geometry.arm_margin(state.left_arm), self.geometry.arm_margin(state.right_arm)) < 0.02:
+        if min(self.robot.margin(LEFT, state.left_arm), self.robot.margin(RIGHT, state.right_arm)) < 0.02:
             return self._fail(time, m, Verdict.REACH_LIMIT, f"arms at their limit at {np.degrees(m.turned):.1f} deg")
         return m
 
@@ -458,14 +457,14 @@ class HybridRotation:
         c = self.config
         V = twists(chain, None, c, np.zeros(6))
         grip = np.array([0.0, c.grip_force])
-        opened = np.array([c.opening, c.open_force])
+        opened = np.array([self.robot.opening, c.open_force])
         if m.stage == "relax":
             closed = min(state.left_gripper, state.right_gripper) < self.marker.handle_width + 2 * c.grip_margin
             if not closed or time - m.since > c.relax:
                 m = changed(m, stage="open", since=time)
             return m, V, grip if closed else opened
         if m.stage == "open":
-            wide = min(state.left_gripper, state.right_gripper) > 0.9 * c.opening
+            wide = min(state.left_gripper, state.right_gripper) > 0.9 * self.robot.opening
             if wide or time - m.since > 2.0:
                 m = changed(m, stage="retreat", since=time, start=m.X)
             return m, V, opened
@@ -496,7 +495,7 @@ class HybridRotation:
         """Commands the poses X; a hand keeps its command if its pose has no inverse near the present joints."""
         q, kept = list(m.q), list(m.X)
         for k, side in enumerate(SIDES):
-            solution = self.geometry.arm_inverse(X[k], side, m.q[k])
+            solution = self.robot.inverse(side, X[k], m.q[k])
             if solution is not None and np.max(np.abs(solution - m.q[k])) < 0.5:
                 q[k], kept[k] = solution, X[k]
         return changed(m, X=(kept[0], kept[1]), q=(q[0], q[1]))
@@ -517,5 +516,5 @@ class HybridRotation:
             moment_right=chain.m[1],
             stem_force=chain.f[0] + chain.f[1],
             squeeze=float((chain.f[1] - chain.f[0]) @ chain.b / 2),
-            center=chain.c + np.array([0, 0, self.geometry.shoulder_height]),
+            center=chain.c,
         )

@@ -26,7 +26,6 @@ import numpy as np
 from valve_drake.behaviors.taught import TaughtReference
 from valve_drake.config import Config, number
 from valve_drake.frames import make
-from valve_drake.kinematics import RobotGeometry
 from valve_drake.memory import changed
 from valve_drake.messages import (
     LEFT,
@@ -42,6 +41,7 @@ from valve_drake.messages import (
     Status,
     Verdict,
 )
+from valve_drake.robot.kinematics import RobotKinematics
 
 
 @dc.dataclass
@@ -61,7 +61,6 @@ class ImageServoConfig(Config):
         0.003, 1e-4, 0.02, "tracking error that is compensated, at most; a larger one means contact [m]"
     )
     reach: float = number(0.20, 0.02, 0.5, "a hand farther than this from where servoing began has gone astray [m]")
-    opening: float = number(0.085, 0.03, 0.09, "of the gripper [m]")
     gripper_force: float = number(40.0, 5.0, 100.0, "of the finger actuator [N]")
 
 
@@ -69,9 +68,9 @@ class ImageServoConfig(Config):
 class Hand:
     """One hand's part of the memory."""
 
-    X_HG: np.ndarray  # commanded pose (3, 4)
-    start: np.ndarray  # p_HG at the beginning
-    goal: np.ndarray  # p_HG to move to, by the last image
+    X_BG: np.ndarray  # commanded pose (3, 4)
+    start: np.ndarray  # p_BG at the beginning
+    goal: np.ndarray  # p_BG to move to, by the last image
     q: np.ndarray
     seen: int = -1
     seen_at: float = 0.0
@@ -92,10 +91,10 @@ class Memory:
 class ImageServo:
     """The mathematics of the stage, for both hands."""
 
-    def __init__(self, config: ImageServoConfig, geometry: RobotGeometry, taught: dict[str, TaughtReference]):
+    def __init__(self, config: ImageServoConfig, robot: RobotKinematics, taught: dict[str, TaughtReference]):
         config.check()
         self.config = copy.copy(config)
-        self.geometry = geometry
+        self.robot = robot
         self.taught = taught
 
     def step(
@@ -111,7 +110,7 @@ class ImageServo:
         status = memory.status
         if status.state == "running":
             status = self._judge(time, mode.activation, hands)
-        gripper = np.array([self.config.opening, self.config.gripper_force])
+        gripper = np.array([self.robot.opening, self.config.gripper_force])
         command = Command(
             time=time,
             left_arm=hands["left"].q,
@@ -131,20 +130,20 @@ class ImageServo:
 
     def _begin(self, time: float, state: RobotState, side: str) -> Hand:
         q = state.left_arm if side == LEFT else state.right_arm
-        X_HG = self.geometry.arm_forward(q, side)
-        return Hand(X_HG=X_HG, start=X_HG[:, 3], goal=X_HG[:, 3], q=q, seen_at=time)
+        X_BG = self.robot.forward(side, q)
+        return Hand(X_BG=X_BG, start=X_BG[:, 3], goal=X_BG[:, 3], q=q, seen_at=time)
 
     def _hand(self, time: float, dt: float, hand: Hand, state: RobotState, side: str, mark: HandleMark) -> Hand:
         q = state.left_arm if side == LEFT else state.right_arm
-        p_now = self.geometry.arm_forward(q, side)[:, 3]
+        p_now = self.robot.forward(side, q)[:, 3]
         # A constant servo error would bias the hand: it is compensated.
-        droop = hand.X_HG[:, 3] - p_now
+        droop = hand.X_BG[:, 3] - p_now
         droop = droop * min(1.0, self.config.max_droop / max(float(np.linalg.norm(droop)), 1e-12))
         gone = int(bool(hand.past) and hand.past[0][0] < time - POSE_HISTORY)
         hand = changed(hand, past=(*hand.past[gone:], (time, p_now + droop)))
         if mark.found and mark.sequence != hand.seen and mark.time >= hand.past[0][0]:
             e = self.taught[side].displacement(mark.feature)
-            R = hand.X_HG[:, :3]
+            R = hand.X_BG[:, :3]
             p_then = min(hand.past, key=lambda item: abs(item[0] - mark.time))[1]
             hand = changed(
                 hand,
@@ -157,16 +156,16 @@ class ImageServo:
         elif not mark.found and mark.sequence != hand.seen:
             hand = changed(hand, seen=mark.sequence, inside=0)
         if time - hand.seen_at > 0.25:  # no image for a while: stand still
-            hand = changed(hand, goal=hand.X_HG[:, 3])
-        step = hand.goal - hand.X_HG[:, 3]
+            hand = changed(hand, goal=hand.X_BG[:, 3])
+        step = hand.goal - hand.X_BG[:, 3]
         most = self.config.speed * dt
         length = float(np.linalg.norm(step))
-        p = hand.X_HG[:, 3] + step * min(1.0, most / max(length, 1e-12))
-        X_HG = make(hand.X_HG[:, :3], p)
-        solution = self.geometry.arm_inverse(X_HG, side, hand.q)
+        p = hand.X_BG[:, 3] + step * min(1.0, most / max(length, 1e-12))
+        X_BG = make(hand.X_BG[:, :3], p)
+        solution = self.robot.inverse(side, X_BG, hand.q)
         if solution is None or np.max(np.abs(solution - hand.q)) > 0.5:
             return hand  # out of reach, or the wrist would turn by far: keep the command
-        return changed(hand, X_HG=X_HG, q=solution)
+        return changed(hand, X_BG=X_BG, q=solution)
 
     def _judge(self, time: float, activation: int, hands: dict[str, Hand]) -> Status:
         c = self.config
@@ -174,7 +173,7 @@ class ImageServo:
         for side, hand in hands.items():
             if time - hand.seen_at > c.lost_after:
                 return Status(time, activation, "failed", Verdict.MARKER_LOST, f"{side} mark lost")
-            if np.linalg.norm(hand.X_HG[:, 3] - hand.start) > c.reach:
+            if np.linalg.norm(hand.X_BG[:, 3] - hand.start) > c.reach:
                 return Status(time, activation, "failed", Verdict.GRASP_MISSED, f"{side} hand ran away")
         if all(hand.inside >= c.images_in_tolerance for hand in hands.values()):
             return Status(time, activation, "succeeded", detail=errors, progress=1.0)

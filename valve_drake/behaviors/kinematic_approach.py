@@ -14,23 +14,13 @@ Frames: frames.py. The base stands still from measure to verify.
 
 import copy
 import dataclasses as dc
-from collections.abc import Callable
 
 import numpy as np
 
-from valve_drake.behaviors.grasp_geometry import (
-    StanceConfig,
-    angle_turned,
-    best_arc,
-    find_stance,
-    hand_in_valve,
-    standoff,
-    turned,
-)
+from valve_drake.behaviors.grasp_geometry import Stances, angle_turned, hand_in_valve, standoff, turned
 from valve_drake.behaviors.joint_path import Path, find_path
-from valve_drake.config import Config, number, numbers
+from valve_drake.config import Config, number
 from valve_drake.frames import compose, inverse, planar, wrap
-from valve_drake.kinematics import ARM_LIMITS, RobotGeometry, both_arms, lateral
 from valve_drake.memory import changed
 from valve_drake.messages import (
     LEFT,
@@ -50,7 +40,7 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.perception.fusion import fuse
-from valve_drake.perception.marker import Marker
+from valve_drake.robot.kinematics import OUTWARD, RobotKinematics
 from valve_drake.task.modes import TABLE
 
 
@@ -59,9 +49,6 @@ class KinematicApproachConfig(Config):
     """Scenario key `kinematic_approach`."""
 
     KEY = "kinematic_approach"
-    home: list[float] = numbers(
-        [1.05, 0.65, -1.9, 0.0, 1.25, 0.0], (-ARM_LIMITS).tolist(), ARM_LIMITS.tolist(), "left arm; mirrored [rad]"
-    )
     joint_speed: float = number(0.9, 0.05, 2.5, "of the fastest joint of a path [rad/s]")
     joint_acceleration: float = number(2.0, 0.1, 20.0, "[rad/s^2]")
     settle: float = number(0.3, 0.05, 5.0, "stillness before a measurement [s]")
@@ -70,7 +57,6 @@ class KinematicApproachConfig(Config):
     mark_ratio: float = number(
         0.9, 0.3, 1.5, "reaching ends early when sqrt(area) of both green marks is this share of the taught one"
     )
-    opening: float = number(0.085, 0.03, 0.09, "gripper open [m]")
     gripper_force: float = number(40.0, 5.0, 100.0, "while opening [N]")
     stance_period: float = number(0.5, 0.1, 10.0, "between two computations of the stance [s]")
     angle_tolerance: float = number(0.035, 0.002, 0.2, "camera angle against the command that counts as turned [rad]")
@@ -93,7 +79,7 @@ class Memory:
     mode: str = ""
     phase: str = ""
     since: float = 0.0  # of the phase [s]
-    q: np.ndarray = dc.field(default_factory=lambda: np.zeros(12))  # command of both arms [rad]
+    q: np.ndarray = dc.field(default_factory=lambda: np.zeros(0))  # command of both arms, left first [rad]
     path: Path | None = None
     looks: tuple[RectangleEstimate, ...] = ()
     seen: int = -1  # sequence of the newest estimate used
@@ -113,32 +99,21 @@ NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms
 class KinematicApproach:
     """The mathematics of the stage.
 
-    view: each wrist camera's view direction in its hand's frame (from the taught reference).
-    is_free(X_BV, q): no contact and enough clearance with both arms at q (12,), the valve at X_BV (None: no valve).
+    stances: where the hands can turn the valve from; they hold robot, marker and view.
     reference_area: of each green mark in the taught image [px^2].
     """
 
-    def __init__(
-        self,
-        config: KinematicApproachConfig,
-        stance: StanceConfig,
-        marker: Marker,
-        geometry: RobotGeometry,
-        view: dict[str, np.ndarray],
-        reference_area: dict[str, float],
-        is_free: Callable[[np.ndarray | None, np.ndarray], bool],
-    ):
+    def __init__(self, config: KinematicApproachConfig, stances: Stances, reference_area: dict[str, float]):
         config.check()
-        stance.check()
-        marker.check()
+        stances.config.check()
+        stances.marker.check()
         self.config = copy.copy(config)
-        self.stance = copy.copy(stance)
-        self.marker = copy.copy(marker)
-        self.geometry = geometry
-        self.view = view
+        self.stances = dc.replace(
+            stances, config=copy.copy(stances.config), marker=copy.copy(stances.marker), view=dict(stances.view)
+        )
+        self.robot: RobotKinematics = stances.robot
         self.reference_area = reference_area
-        self.is_free = is_free
-        self.home = both_arms(np.array(config.home))
+        self.home = self.robot.home
 
     # ------------------------------------------------------------ the step
     def step(
@@ -176,8 +151,12 @@ class KinematicApproach:
             m = self._homing(time, m, self._valve(m, state, turn))
         if m.path is not None:
             m = changed(m, q=m.path.sample(time))
-        gripper = np.array([self.config.opening, self.config.gripper_force])
-        return m, Command(time=time, left_arm=m.q[:6], right_arm=m.q[6:], left_gripper=gripper, right_gripper=gripper)
+        gripper = np.array([self.robot.opening, self.config.gripper_force])
+        arms = self.robot.split(m.q)
+        command = Command(
+            time=time, left_arm=arms[LEFT], right_arm=arms[RIGHT], left_gripper=gripper, right_gripper=gripper
+        )
+        return m, command
 
     def _status(
         self, m: Memory, time: float, state: str, verdict: str = "", detail: str = "", cause: str = Cause.NONE
@@ -203,10 +182,10 @@ class KinematicApproach:
         """Plans a path from the present command to `goal`; phase "moving", or "blocked" if there is none."""
         if np.max(np.abs(goal - m.q)) < 1e-6:
             return changed(m, phase="moving", path=None, since=time)
-        limits = np.tile(ARM_LIMITS, 2)
+        arms, split = self.robot.arms, self.robot.split
 
         def is_free(q: np.ndarray) -> bool:
-            return bool(np.all(np.abs(q) <= limits)) and self.is_free(X_BV, q)
+            return all(arms[side].within(part) for side, part in split(q).items()) and self.stances.is_free(X_BV, q)
 
         points = find_path(m.q, goal, self._vias(m.q, goal, X_BV), is_free)
         if points is None:
@@ -218,15 +197,14 @@ class KinematicApproach:
         """Via poses: both hands drawn straight back from the end of the path at the valve; nearly always free."""
         if X_BV is None:
             return []
-        at_valve = q if np.allclose(goal, self.home) else goal
+        at_valve = self.robot.split(q if np.allclose(goal, self.home) else goal)
         out: list[np.ndarray] = []
         for back in (0.10, 0.16, 0.22):
             arms = []
-            for k, side in enumerate(SIDES):
-                X_HG = self.geometry.arm_forward(at_valve[6 * k : 6 * k + 6], side)
-                X_HG = standoff(X_HG, np.array([0.0, 0, 1]), back)
-                X_HG = X_HG + np.array([[0, 0, 0, 0], [0, 0, 0, lateral(side) * back / 2], [0, 0, 0, 0]])
-                arms.append(self.geometry.arm_inverse(X_HG, side, at_valve[6 * k : 6 * k + 6]))
+            for side in SIDES:
+                X_BG = standoff(self.robot.forward(side, at_valve[side]), np.array([0.0, 0, 1]), back)
+                X_BG[1, 3] += OUTWARD[side] * back / 2
+                arms.append(self.robot.inverse(side, X_BG, at_valve[side]))
             reached = [q for q in arms if q is not None]
             if len(reached) == len(arms):
                 out.append(np.concatenate(reached))
@@ -249,8 +227,8 @@ class KinematicApproach:
         fused = fuse(looks)
         if not fused.found:
             return m
-        base, margin = find_stance(fused.X_OV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view)
-        good = margin >= self.stance.margin_min
+        base, margin = self.stances.find(fused.X_OV, mode.turn_angle)
+        good = margin >= self.stances.config.margin_min
         reason = "" if good else f"no stance holds both handles through the turn (margin {margin:.2f})"
         return changed(m, stance=Stance(time=estimate.time, found=good, base=base, margin=margin, reason=reason))
 
@@ -282,14 +260,14 @@ class KinematicApproach:
         if not fused.found:
             return self._status(changed(m, phase="end"), time, "failed", Verdict.MARKER_LOST, fused.reason)
         X_BV = compose(inverse(planar(*state.odometry[:3])), fused.X_OV)
-        arc = best_arc(X_BV, mode.turn_angle, self.geometry, self.marker, self.stance, self.view)
-        if arc.margin < self.stance.margin_min:
+        arc = self.stances.best_arc(X_BV, mode.turn_angle)
+        if arc.margin < self.stances.config.margin_min:
             m = self._find_stance(time, changed(m, stance_looks=m.looks, seen=-1), mode, estimate)
             detail = f"arm margin {arc.margin:.2f} from here"
             return self._status(
                 changed(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, detail, cause=Cause.STANCE
             )
-        grasps = {side: compose(X_BV, hand_in_valve(side, arc.swapped, self.marker)) for side in SIDES}
+        grasps = {side: compose(X_BV, hand_in_valve(side, arc.swapped, self.stances.marker)) for side in SIDES}
         plan = GraspPlan(
             time=time,
             found=True,
@@ -342,13 +320,12 @@ class KinematicApproach:
         return float(np.sqrt(mark.area / self.reference_area[side])) if mark.found else 0.0
 
     def _standoff_joints(self, plan: GraspPlan) -> np.ndarray | None:
-        X_HB = inverse(self.geometry.X_BH())
         arms = []
         for side in SIDES:
             X_BG = plan.X_BG_left if side == LEFT else plan.X_BG_right
-            near = self.geometry.arm_inverse(compose(X_HB, X_BG), side)
-            X_HG = compose(X_HB, standoff(X_BG, self.view[side], self.stance.standoff))
-            arms.append(self.geometry.arm_inverse(X_HG, side, near))
+            near = self.robot.inverse(side, X_BG)
+            back = standoff(X_BG, self.stances.view[side], self.stances.config.standoff)
+            arms.append(None if near is None else self.robot.inverse(side, back, near))
         reached = [q for q in arms if q is not None]
         return np.concatenate(reached) if len(reached) == len(arms) else None
 

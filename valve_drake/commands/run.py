@@ -67,7 +67,8 @@ def command(options: argparse.Namespace) -> int:
     if options.log is None:
         log = Path("logs") / f"run-{scenario.seed}.mcap"
     else:
-        inputs = [Path(name) for name in (options.scenario, scenario.head_calibration, scenario.taught) if name]
+        names = (options.scenario, scenario.robot, scenario.head_calibration, scenario.taught)
+        inputs = [Path(name) for name in names if name]
         companions = (".json", ".html") if recording else (".json",)
         log = check_log(options.log, "--log", options.overwrite, inputs, companions)
     imports = time.process_time()

@@ -8,7 +8,7 @@ from valve_drake.frames import compose, make, planar
 from valve_drake.messages import SIDES, GraspPlan, RectangleEstimate, RobotState, TurnState
 from valve_drake.perception.marker import Marker
 from valve_drake.recording.scene import parts_of, scene
-from valve_drake.stations.scene import model
+from valve_drake.robot.robot import Robot
 
 Transforms = list[tuple[str, str, np.ndarray]]
 ODOMETRY = "odometry"
@@ -17,13 +17,15 @@ ODOMETRY = "odometry"
 class RobotFrames:
     """The controllers' model of the robot in its measured pose. Frames are named as in SceneGraph ("robot::chest")."""
 
-    def __init__(self, head: StereoHead, marker: Marker):
-        self._model = shared = model()
-        self._plant, robot = shared.plant, shared.robot
+    def __init__(self, robot: Robot, head: StereoHead, marker: Marker):
+        self._model = shared = robot.model
+        self._plant, instance = shared.plant, shared.robot
         self._context = self._plant.CreateDefaultContext()
         self._poses = self._plant.get_body_poses_output_port()
-        self._bodies = {int(i): f"robot::{self._plant.get_body(i).name()}" for i in self._plant.GetBodyIndices(robot)}
-        eye = self._plant.GetFrameByName("head_left_camera", robot)
+        self._bodies = {
+            int(i): f"robot::{self._plant.get_body(i).name()}" for i in self._plant.GetBodyIndices(instance)
+        }
+        eye = self._plant.GetFrameByName(robot.description.cameras["head_left"], instance)
         self._constant = [
             (f"robot::{eye.body().name()}", "head_left", eye.GetFixedPoseInBodyFrame().GetAsMatrix34()),
             ("head_left", "head_right", head.X_LR),
@@ -31,9 +33,9 @@ class RobotFrames:
         self._X_VWheel = make(np.eye(3), np.array([0.0, 0.0, marker.panel_depth]))
         self.scene = scene(parts_of(shared.scene_graph.model_inspector()))
         self._slots = {
-            "base": [self._slot(n) for n in ("base_x", "base_y", "base_yaw")],
-            "torso": [self._slot(n) for n in ("waist", "neck_pitch", "neck_yaw")],
-            **{side: [self._slot(f"{side}_arm_{k}") for k in range(1, 7)] for side in SIDES},
+            "base": [self._slot(n) for n in robot.base.names],
+            "torso": [self._slot(n) for n in robot.torso.names],
+            **{side: [self._slot(n) for n in robot.arms[side].names] for side in SIDES},
         }
         self._fingers = {side: [self._slot(f"{side}_finger_{k}") for k in (1, 2)] for side in SIDES}
 

@@ -37,6 +37,7 @@ from valve_drake.camera.lens import LensModel, distortion_maps
 from valve_drake.frames import compose, inverse, make, rot_z
 from valve_drake.messages import CameraFrame
 from valve_drake.ports import PythonSystem
+from valve_drake.robot.description import RobotDescription
 from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.simulation_config import CameraConfig, LightConfig, ValveConfig
@@ -140,11 +141,12 @@ class CameraRig:
         light: LightConfig,
         camera: CameraConfig,
         seed: int,
+        robot: RobotDescription | None = None,
     ):
         builder = DiagramBuilder()
         self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1.0)
         scene_graph.set_name("scene_graph")
-        self.scene = add_scene(self.plant, valve, marker_size)
+        self.scene = add_scene(self.plant, valve, marker_size, robot)
         self.plant.Finalize()
         self._lensed = {name: _Lensed(mount.lens) for name, mount in mounts.items()}
         RENDERERS[camera.renderer](scene_graph, lights(light), camera.supersample, self._needed)

@@ -29,8 +29,9 @@ from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 from valve_drake import profiling
 from valve_drake.messages import SIDES
 from valve_drake.ports import SLOT, TICK, PythonSystem
+from valve_drake.robot.description import RobotDescription
 from valve_drake.stations.contract import CONTRACT
-from valve_drake.stations.scene import BASE, TORSO, add_scene, arm_joints, parse
+from valve_drake.stations.scene import BASE, TORSO, add_robot, add_scene, arm_joints
 from valve_drake.stations.simulation_config import ValveConfig
 
 STEPS = 2  # of the plant in a tick; twice as many leave forces and angles as they are and double the work
@@ -81,6 +82,7 @@ class PlantSystem(PythonSystem):
         marker_size: tuple[float, float],
         start: Mapping[str, float],
         offsets: Mapping[str, np.ndarray],
+        robot: RobotDescription | None = None,
     ):
         """start: joint of the robot -> where it is at first [m, rad]; offsets: side -> what the arm's encoders read at
         the joints' true zero (6,) [rad]: an arm goes to where its encoders read the command."""
@@ -97,7 +99,7 @@ class PlantSystem(PythonSystem):
         self.plant, self.scene_graph = AddMultibodyPlant(config, builder)
         self.plant.set_name("plant")
         self.scene_graph.set_name("scene_graph")
-        scene = add_scene(self.plant, valve, marker_size)
+        scene = add_scene(self.plant, valve, marker_size, robot)
         self.robot, self.valve = scene.robot, scene.valve
         self.plant.Finalize()
         _leave_out_looks(self.plant, self.scene_graph)
@@ -105,7 +107,7 @@ class PlantSystem(PythonSystem):
             self.plant.GetJointByName(name, self.robot).set_default_positions([value])
         stem = self.plant.GetJointByName("stem", self.valve)
         stem.set_default_positions([valve.bar_angle + max(valve.position, 0.0)])
-        self._gravity = _add_gravity(builder, self.plant, self.robot)
+        self._gravity = _add_gravity(builder, self.plant, self.robot, robot)
         still = builder.AddNamedSystem("valve_at_rest", ConstantVectorSource(np.zeros(2)))
         builder.Connect(still.get_output_port(), self.plant.get_desired_state_input_port(self.valve))
         builder.ExportInput(self.plant.get_desired_state_input_port(self.robot), "desired")
@@ -212,10 +214,12 @@ def _driven(base: np.ndarray, forward: float, yaw_rate: float, time: float) -> n
     return np.array([x + way * math.cos(middle), y + way * math.sin(middle), heading + yaw_rate * time])
 
 
-def _add_gravity(builder: DiagramBuilder, plant: MultibodyPlant, robot: ModelInstanceIndex) -> MultibodyPlant:
+def _add_gravity(
+    builder: DiagramBuilder, plant: MultibodyPlant, robot: ModelInstanceIndex, described: RobotDescription | None
+) -> MultibodyPlant:
     """Feeds gravity forward to the robot's actuators -> the model that tells it, which must outlive the diagram."""
     model = MultibodyPlant(plant.time_step())
-    parse(model, "robot")
+    add_robot(model, described)
     model.Finalize()
     mode = InverseDynamics.InverseDynamicsMode.kGravityCompensation
     gravity = builder.AddNamedSystem("gravity_compensation", InverseDynamics(model, mode))

@@ -2,19 +2,17 @@
 physics and once each for the cameras and the 3D view, and by pictures in the documents."""
 
 import dataclasses as dc
-import functools
-from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Box, SceneGraph
+from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
-from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from valve_drake import resources
 from valve_drake.frames import make, rot_y, rot_z
+from valve_drake.robot import description, model
+from valve_drake.robot.description import RobotDescription
 from valve_drake.stations.simulation_config import StartConfig, ValveConfig
 
 TORSO = ("waist", "neck_pitch", "neck_yaw")  # joints of the robot's model, in the order of the contract
@@ -37,36 +35,14 @@ def arm_joints(side: str) -> list[str]:
     return [f"{side}_arm_{k}" for k in range(1, 7)]
 
 
-def parse(plant: MultibodyPlant, model: str) -> ModelInstanceIndex:
-    """Adds models/<model>/<model>.sdf."""
-    parser = Parser(plant)
-    parser.package_map().AddPackageXml(str(resources.models() / "package.xml"))
-    return parser.AddModels(str(resources.models() / model / f"{model}.sdf"))[0]
+def parse(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
+    """Adds models/<name>/<name>.sdf."""
+    return model.parse(plant, resources.models() / name / f"{name}.sdf")
 
 
-@dc.dataclass(frozen=True)
-class Model:
-    """The controllers' model of the world, apart from the simulated plant: the robot, and a valve that is free."""
-
-    diagram: Diagram
-    plant: MultibodyPlant
-    scene_graph: SceneGraph
-    robot: ModelInstanceIndex
-    valve: ModelInstanceIndex
-
-
-def model() -> Model:
-    """The controllers' model. All who ask share it, each with a Context of its own."""
-    return _model(resources.models())
-
-
-@functools.lru_cache(maxsize=1)
-def _model(folder: Path) -> Model:
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-    robot, valve = parse(plant, "robot"), parse(plant, "valve")
-    plant.Finalize()
-    return Model(builder.Build(), plant, scene_graph, robot, valve)
+def add_robot(plant: MultibodyPlant, robot: RobotDescription | None) -> ModelInstanceIndex:
+    """Adds the robot; None: our own."""
+    return model.add_robot(plant, description.load(description.find(description.OURS)) if robot is None else robot)
 
 
 def panel_pose(valve: ValveConfig) -> np.ndarray:
@@ -83,10 +59,15 @@ def start_pose(start: StartConfig, valve: ValveConfig) -> np.ndarray:
 
 
 def add_scene(
-    plant: MultibodyPlant, valve: ValveConfig, marker_size: tuple[float, float], *, laboratory: bool = True
+    plant: MultibodyPlant,
+    valve: ValveConfig,
+    marker_size: tuple[float, float],
+    robot: RobotDescription | None = None,
+    *,
+    laboratory: bool = True,
 ) -> Scene:
     """Adds everything to a plant that is not finalized. The valve's limits and friction are those of the config."""
-    robot = parse(plant, "robot")
+    robot_model = add_robot(plant, robot)
     valve_model = parse(plant, "valve")
     X_WP = panel_pose(valve)
     plant.WeldFrames(  # mounts the panel in the room
@@ -109,4 +90,4 @@ def add_scene(
     friction = plant.GetJointActuatorByName("stem", valve_model)
     friction.set_controller_gains(PdControllerGains(p=1e-4, d=1e5))
     friction.set_effort_limit(SEIZED if valve.seized else max(valve.friction, 1e-6))
-    return Scene(robot, valve_model)
+    return Scene(robot_model, valve_model)

@@ -18,6 +18,7 @@ from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
 from valve_drake.messages import DEVICES, SIDES, Health
 from valve_drake.ports import TICK, Block, Inputs, Outputs, PythonSystem
+from valve_drake.robot.description import RobotDescription
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, TRUTH, check_contract
@@ -214,11 +215,15 @@ def make_mounts(head: StereoHead, simulation: SimulationConfig, seed: int) -> di
 
 
 def rig_arguments(
-    simulation: SimulationConfig, marker_size: tuple[float, float], head: StereoHead, seed: int
+    simulation: SimulationConfig,
+    marker_size: tuple[float, float],
+    head: StereoHead,
+    seed: int,
+    robot: RobotDescription | None = None,
 ) -> tuple[Any, ...]:
     """The arguments of CameraRig, or of CameraWorkers, for the station's cameras."""
     mounts = make_mounts(head, simulation, seed)
-    return mounts, simulation.valve, marker_size, simulation.light, simulation.camera, seed
+    return mounts, simulation.valve, marker_size, simulation.light, simulation.camera, seed, robot
 
 
 def _select(physics: PlantSystem, joints: Sequence[str], what: str) -> np.ndarray:
@@ -248,6 +253,7 @@ def make_simulated_station(
     seed: int,
     meshcat: Meshcat | None = None,
     workers: CameraWorkers | None = None,
+    robot: RobotDescription | None = None,
 ) -> Diagram:
     """The station as a Diagram. simulation: resolved (no distributions left); home: both arms (12,) [rad].
 
@@ -260,7 +266,7 @@ def make_simulated_station(
     for k, side in enumerate(SIDES):
         start |= dict(zip(arm_joints(side), home[6 * k : 6 * k + 6] - offsets[side]))  # home is what the encoders read
         start |= {f"{side}_finger_{finger}": opening / 2 for finger in (1, 2)}
-    physics = builder.AddSystem(PlantSystem(valve, marker_size, start, offsets))
+    physics = builder.AddSystem(PlantSystem(valve, marker_size, start, offsets, robot))
     state, plant = physics.GetOutputPort("state"), physics.plant
     for name in COMMANDS:
         builder.ExportInput(physics.GetInputPort(name), name)
@@ -295,7 +301,7 @@ def make_simulated_station(
         builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
 
     camera = simulation.camera
-    images = CameraRig(*rig_arguments(simulation, marker_size, head, seed)) if workers is None else workers
+    images = CameraRig(*rig_arguments(simulation, marker_size, head, seed, robot)) if workers is None else workers
     positions = builder.AddSystem(MatrixGain(np.eye(plant.num_positions(), plant.num_multibody_states())))
     positions.set_name("positions")
     builder.Connect(state, positions.get_input_port())
@@ -315,7 +321,7 @@ def make_simulated_station(
         builder.ExportOutput(truth.GetOutputPort(name), TRUTH + name)
 
     if meshcat is not None:
-        physics.view = _add_view(builder, positions.get_output_port(), valve, marker_size, meshcat)  # lives as long
+        physics.view = _add_view(builder, positions.get_output_port(), valve, marker_size, meshcat, robot)  # lives as long
     station = builder.Build()
     station.set_name("simulated")
     check_contract(station)
@@ -328,12 +334,13 @@ def _add_view(
     valve: ValveConfig,
     marker_size: tuple[float, float],
     meshcat: Meshcat,
+    robot: RobotDescription | None,
 ) -> MultibodyPlant:
     """Shows the positions in a scene of its own, with all looks -> its plant, which must outlive the diagram."""
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
-    add_scene(plant, valve, marker_size)
+    add_scene(plant, valve, marker_size, robot)
     plant.Finalize()
     poses = builder.AddNamedSystem("poses", MultibodyPositionToGeometryPose(plant))
     builder.Connect(positions, poses.get_input_port())

@@ -13,16 +13,16 @@ The first command of each joint is its measured position.
 
 import dataclasses as dc
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from valve_drake.checks import ConfigError, require
 from valve_drake.config import Config, number, numbers
-from valve_drake.kinematics import ARM_LIMITS
 from valve_drake.memory import changed
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, Health, ModeState, RobotState, SelectorReport
 from valve_drake.motion import follow
+from valve_drake.robot.kinematics import Joints
 from valve_drake.task.modes import HOLD, OPEN, TABLE
 
 # Groups of joints commanded by position, in this order in every vector of this file.
@@ -102,17 +102,18 @@ class Bounds:
     base_acceleration: np.ndarray  # (2,)
 
 
-def bounds(config: CommandSelectorConfig) -> Bounds:
+def bounds(config: CommandSelectorConfig, arms: Mapping[str, Joints]) -> Bounds:
+    """arms: of the robot, by side."""
     c = config
 
-    def joints(torso: list[float], arm: list[float], gripper: float) -> np.ndarray:
-        return np.array([*torso, *arm, *arm, gripper, gripper])
+    def joints(torso: list[float], arms: Sequence[Sequence[float]], gripper: float) -> np.ndarray:
+        return np.array([*torso, *(value for arm in arms for value in arm), gripper, gripper])
 
     return Bounds(
-        low=joints(c.torso_low, (-ARM_LIMITS).tolist(), 0.0),
-        high=joints(c.torso_high, ARM_LIMITS.tolist(), c.gripper_high),
-        speed=joints(c.torso_speed, c.arm_speed, c.gripper_speed),
-        acceleration=joints(c.torso_acceleration, c.arm_acceleration, c.gripper_acceleration),
+        low=joints(c.torso_low, [arms[side].low.tolist() for side in SIDES], 0.0),
+        high=joints(c.torso_high, [arms[side].high.tolist() for side in SIDES], c.gripper_high),
+        speed=joints(c.torso_speed, [c.arm_speed] * 2, c.gripper_speed),
+        acceleration=joints(c.torso_acceleration, [c.arm_acceleration] * 2, c.gripper_acceleration),
         base_speed=np.array(c.base_speed),
         base_acceleration=np.array(c.base_acceleration),
     )
@@ -135,7 +136,7 @@ class Memory:
     behind: tuple[int, ...] = (0,) * len(FOLLOWERS)  # ticks in a row behind the command
 
 
-def start(config: CommandSelectorConfig, initial: Mapping[str, np.ndarray]) -> Memory:
+def start(config: CommandSelectorConfig, initial: Mapping[str, np.ndarray], arms: Mapping[str, Joints]) -> Memory:
     """Memory before the first step, holding `initial` (port name -> vector). Raises ConfigError if one does not fit."""
     for port, size in PORTS.items():
         if port not in initial or np.shape(initial[port]) != (size,) or not np.all(np.isfinite(initial[port])):
@@ -143,7 +144,7 @@ def start(config: CommandSelectorConfig, initial: Mapping[str, np.ndarray]) -> M
     position = np.concatenate([np.asarray(initial[f"{group}.position_command"], float) for group in JOINTS])
     force = np.concatenate([np.asarray(initial[f"{group}.force_limit"], float) for group in GRIPPERS])
     twist = np.array(initial["base.twist_command"], float)
-    return Memory(bounds(config), position, np.zeros(17), position, force, twist)
+    return Memory(bounds(config, arms), position, np.zeros(17), position, force, twist)
 
 
 def outputs(memory: Memory) -> dict[str, np.ndarray]:

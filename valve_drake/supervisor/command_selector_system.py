@@ -6,6 +6,7 @@ import numpy as np
 
 from valve_drake.messages import Command, Health, ModeState, RobotState, SelectorReport
 from valve_drake.ports import Block, Inputs, Outputs
+from valve_drake.robot.kinematics import Joints
 from valve_drake.supervisor.command_selector import (
     PORTS,
     CommandSelectorConfig,
@@ -44,17 +45,21 @@ class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
     {side}_gripper.force_limit       out  vector(1)       [N]
     report                           out  SelectorReport
 
-    initial: what the output vectors hold until the first robot state, by port name.
+    initial: what the output vectors hold until the first robot state, by port name. arms: of the robot, by side.
     """
 
     OUTPUTS = PORTS | {"report": SelectorReport}
 
     def __init__(
-        self, config: CommandSelectorConfig, initial: Mapping[str, np.ndarray], name: str = "command_selector"
+        self,
+        config: CommandSelectorConfig,
+        initial: Mapping[str, np.ndarray],
+        arms: Mapping[str, Joints],
+        name: str = "command_selector",
     ):
         config.check()
         self.config = config
-        self._start = start(config, initial)
+        self._start = start(config, initial, arms)
         super().__init__(name, slot=2)
 
     def initial(self) -> Memory:

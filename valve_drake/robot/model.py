@@ -1,0 +1,246 @@
+"""The robot's model in Drake, made from its description: once for the controllers, and again wherever one simulates."""
+
+import dataclasses as dc
+import difflib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    Frame,
+    Joint,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.framework import Diagram, DiagramBuilder
+
+from valve_drake import resources
+from valve_drake.checks import ConfigError, shown
+from valve_drake.messages import SIDES
+from valve_drake.robot.description import RobotDescription, model_file, package_folders
+
+CARRIAGE = 0.01  # mass of each that a model without planar joints gets [kg]
+EFFORT, BASE_EFFORT = 100.0, 2000.0  # of a joint whose file states none, of an added base joint [N or N m]
+
+
+@dc.dataclass(frozen=True)
+class Mimic:
+    """A joint that follows another: its position is multiplier times the other's, plus offset."""
+
+    joint: str
+    follows: str
+    multiplier: float
+    offset: float
+
+
+@dc.dataclass(frozen=True)
+class Model:
+    """The controllers' model of the world, apart from the simulated plant: the robot, and a valve that is free."""
+
+    diagram: Diagram
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    robot: ModelInstanceIndex
+    valve: ModelInstanceIndex
+    mimics: tuple[Mimic, ...]
+
+
+def parse(plant: MultibodyPlant, path: Path) -> ModelInstanceIndex:
+    """Adds the one model of a file. Raises ConfigError if Drake cannot read it, or it holds several."""
+    parser = Parser(plant)
+    packages = parser.package_map()
+    packages.AddPackageXml(str(resources.models() / "package.xml"))
+    for folder in package_folders():
+        packages.PopulateFromFolder(str(folder))
+    try:
+        models: list[ModelInstanceIndex] = parser.AddModels(str(path))
+    except (RuntimeError, ValueError) as error:
+        raise ConfigError(f"model {path} cannot be read: {_first(str(error))}") from error
+    if len(models) != 1:
+        raise ConfigError(f"model {path} must hold one model, got {len(models)}")
+    return models[0]
+
+
+def _first(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return shown(lines[0]).strip("'\"") if lines else "no reason given"
+
+
+def add_robot(plant: MultibodyPlant, robot: RobotDescription) -> ModelInstanceIndex:
+    """Adds the robot to a plant that is not finalized: welds, frames, base joints, actuators, gravity.
+
+    Raises ConfigError in one line: a name that the model lacks, a file that cannot be read.
+    """
+    path = model_file(robot)
+    model = parse(plant, path)
+    efforts = {name: effort for name, effort, _ in _file_joints(path) if effort is not None}
+    for k, name in enumerate(robot.weld):
+        joint = joint_named(plant, model, name, f"weld[{k}]")
+        parent, child = joint.frame_on_parent(), joint.frame_on_child()
+        try:
+            plant.RemoveJoint(joint)
+        except RuntimeError as error:
+            raise ConfigError(f"weld[{k}]: {shown(name)} cannot be welded: {_first(str(error))}") from error
+        plant.WeldFrames(parent, child)
+    for name, frame in robot.frames.items():
+        if plant.HasFrameNamed(name, model):
+            raise ConfigError(f"frames.{name}: the model has a frame of this name")
+        link = frame_named(plant, model, frame.link, f"frames.{name}.link")
+        X = RigidTransform(RollPitchYaw(frame.rpy), frame.xyz)
+        plant.AddFrame(FixedOffsetFrame(name, link, X, model))
+    base = frame_named(plant, model, robot.base.frame, "base.frame")
+    if not base_chain(plant, model, base.body()) and robot.base.drive != "fixed":
+        _add_carriages(plant, model, base.body())
+    for key, name in named_joints(robot):
+        joint = joint_named(plant, model, name, key)
+        if joint.num_velocities() != 1:
+            raise ConfigError(f"{key} must be a joint with one axis, got {shown(name)} ({joint.type_name()})")
+        if not _has_actuator(plant, joint):
+            plant.AddJointActuator(name, joint, efforts.get(name, EFFORT))
+    if robot.counterbalanced:
+        plant.set_gravity_enabled(model, False)
+    return model
+
+
+def named_joints(robot: RobotDescription) -> Iterator[tuple[str, str]]:
+    """Key and name of every joint that moves, base apart."""
+    for k, name in enumerate(robot.lift.joints):
+        yield f"lift.joints[{k}]", name
+    for key in ("waist", "tilt", "pan"):
+        if name := getattr(robot.gaze, key):
+            yield f"gaze.{key}", name
+    for side in SIDES:
+        for k, name in enumerate(robot.arm(side).joints):
+            yield f"arms.{side}.joints[{k}]", name
+        yield f"grippers.{side}.joint", robot.gripper(side).joint
+
+
+def _has_actuator(plant: MultibodyPlant, joint: Joint) -> bool:
+    return any(plant.get_joint_actuator(i).joint().index() == joint.index() for i in plant.GetJointActuatorIndices())
+
+
+def parent_joint(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> Joint | None:
+    """The joint that carries a body."""
+    for index in plant.GetJointIndices(model):
+        joint = plant.get_joint(index)
+        if joint.child_body().index() == body.index():
+            return joint
+    return None
+
+
+def base_chain(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> list[Joint]:
+    """The moving joints between the world and the base's body, the world's first."""
+    chain: list[Joint] = []
+    while (joint := parent_joint(plant, model, body)) is not None:
+        if joint.type_name() != "weld":
+            chain.insert(0, joint)
+        body = joint.parent_body()
+    return chain
+
+
+def _add_carriages(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> None:
+    """The joints base_x, base_y and base_yaw between the world and the model's root, with the body on the floor."""
+    while (joint := parent_joint(plant, model, body)) is not None:
+        body = joint.parent_body()
+    little = SpatialInertia(CARRIAGE, [0, 0, 0], UnitInertia.SolidSphere(0.05))
+    parent = plant.world_body()
+    for name, axis in (("base_x", [1, 0, 0]), ("base_y", [0, 1, 0]), ("base_yaw", [0, 0, 1])):
+        child = body if name == "base_yaw" else plant.AddRigidBody(f"{name}_carriage", model, little)
+        kind = RevoluteJoint if name == "base_yaw" else PrismaticJoint
+        joint = plant.AddJoint(kind(name, parent.body_frame(), child.body_frame(), axis))
+        plant.AddJointActuator(name, joint, BASE_EFFORT)
+        parent = child
+
+
+# ---------------------------------------------------------------- names
+
+
+def joint_named(plant: MultibodyPlant, model: ModelInstanceIndex, name: str, key: str) -> Joint:
+    """Raises ConfigError with the names that are near."""
+    if plant.HasJointNamed(name, model):
+        return plant.GetJointByName(name, model)
+    raise _unknown("joint", name, key, (plant.get_joint(i).name() for i in plant.GetJointIndices(model)))
+
+
+def frame_named(plant: MultibodyPlant, model: ModelInstanceIndex, name: str, key: str) -> Frame:
+    """A frame or a link's own frame. Raises ConfigError with the names that are near."""
+    if plant.HasFrameNamed(name, model):
+        return plant.GetFrameByName(name, model)
+    raise _unknown("frame", name, key, (plant.get_frame(i).name() for i in plant.GetFrameIndices(model)))
+
+
+def _unknown(what: str, name: str, key: str, known: Iterable[str]) -> ConfigError:
+    near = difflib.get_close_matches(name, list(known), 3, 0.6)
+    hint = f"; near it: {', '.join(near)}" if near else ""
+    return ConfigError(f"{key} must be a {what} of the model, got {shown(name)}{hint}")
+
+
+# ---------------------------------------------------------------- what Drake does not tell of a file
+
+
+def _file_joints(path: Path) -> Iterator[tuple[str, float | None, Mimic | None]]:
+    """Name, effort limit and mimic of every joint of an SDF or URDF file, as they are written."""
+    if path.suffix.lower() not in (".sdf", ".urdf", ".xml"):
+        return
+    for joint in ElementTree.parse(path).getroot().iter("joint"):
+        name = joint.get("name")
+        if name is None:  # within a URDF transmission
+            continue
+        limit = joint.find("limit")  # URDF
+        text = limit.get("effort") if limit is not None else joint.findtext("axis/limit/effort")
+        try:
+            effort = float(text) if text else None
+            yield name, effort if effort and effort > 0 else None, _mimic(name, joint)
+        except ValueError as error:
+            raise ConfigError(f"model {path}: joint {shown(name)} has a limit or mimic that is no number") from error
+
+
+def _mimic(name: str, joint: ElementTree.Element) -> Mimic | None:
+    for element in joint.iter():
+        if element.tag.rpartition("}")[2].rpartition(":")[2] == "mimic" and (follows := element.get("joint")):
+
+            def value(key: str, default: str, element: ElementTree.Element = element) -> float:
+                return float(element.get(key) or element.findtext(key) or default)
+
+            return Mimic(name, follows, value("multiplier", "1"), value("offset", "0"))
+    return None
+
+
+def mimics(robot: RobotDescription) -> tuple[Mimic, ...]:
+    """The joints that follow others, a leader before its followers. Drake has them, but not for Python."""
+    found = {m.joint: m for _, _, m in _file_joints(model_file(robot)) if m is not None and m.joint not in robot.weld}
+    out: list[Mimic] = []
+
+    def add(mimic: Mimic, depth: int = 0) -> None:
+        if mimic in out:
+            return
+        if depth > len(found):
+            raise ConfigError(f"model {model_file(robot)}: joint {shown(mimic.joint)} follows itself")
+        if mimic.follows in found:
+            add(found[mimic.follows], depth + 1)
+        out.append(mimic)
+
+    for mimic in found.values():
+        add(mimic)
+    return tuple(out)
+
+
+# ---------------------------------------------------------------- the controllers' model
+
+
+def make_model(robot: RobotDescription) -> Model:
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    model = add_robot(plant, robot)
+    valve = parse(plant, resources.models() / "valve" / "valve.sdf")
+    plant.Finalize()
+    return Model(builder.Build(), plant, scene_graph, model, valve, mimics(robot))

@@ -1,0 +1,450 @@
+"""The robot as one frozen value: joint groups, limits, frames, kinematics and loads, of its model and robot.yaml.
+
+    robot = Robot.load("models/robot/robot.yaml")
+    q = robot.inverse("left", X_BG, near=q)
+
+All questions are answered from the model's own numbers. A Context of Drake is held for scratch: every question sets all
+that its answer depends on, so the same question gives the same bits, and copies share the value.
+"""
+
+import dataclasses as dc
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, JacobianWrtVariable, Joint, ModelInstanceIndex, PrismaticJoint
+
+from valve_drake.checks import ConfigError, require, shown
+from valve_drake.frames import compose, planar
+from valve_drake.messages import LEFT, RIGHT, SIDES
+from valve_drake.robot import description as descriptions
+from valve_drake.robot import kinematics
+from valve_drake.robot.description import TORQUE, RobotDescription
+from valve_drake.robot.kinematics import Arm, HandLoad, Joints
+from valve_drake.robot.model import (
+    Mimic,
+    Model,
+    base_chain,
+    frame_named,
+    joint_named,
+    make_model,
+    named_joints,
+    parent_joint,
+)
+
+_ORIGIN = np.zeros(3)
+_OPENINGS = 65  # positions of a gripper's joint at which its opening is read
+_TOUCH = 1e-4  # an opening may lack so much of what is asked for [m]
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Gripper:
+    """A gripper: its joint's positions and the openings between its pads there, both rising or the first falling."""
+
+    joint: str
+    positions: np.ndarray  # (K,) [rad or m]
+    openings: np.ndarray  # (K,) rising [m]
+
+    def opening(self, position: float) -> float:
+        """Between the pads [m]."""
+        order = slice(None) if self.positions[0] < self.positions[-1] else slice(None, None, -1)
+        return float(np.interp(position, self.positions[order], self.openings[order]))
+
+    def position(self, opening: float) -> float:
+        """Of the joint [rad or m]."""
+        return float(np.interp(opening, self.openings, self.positions))
+
+
+@dc.dataclass(frozen=True, eq=False)
+class _Chain:
+    """Where an arm's numbers stand in the plant's vectors."""
+
+    q: np.ndarray  # (n,)
+    v: np.ndarray
+    grip: Frame
+    shoulder: Frame  # that the first joint turns in
+    reach: float  # of the grip point from there, at most [m]
+
+
+class Robot:
+    """See the module. Immutable; `robot.yaml` is `description`, the model `model`."""
+
+    description: RobotDescription
+    model: Model
+    base: Joints  # x, y, yaw; none if it is fixed
+    posture: Joints  # lift and waist: what holds still while the hands work
+    torso: Joints  # posture, tilt, pan
+    arms: Mapping[str, Arm]
+    hands: Mapping[str, HandLoad]
+    grippers: Mapping[str, Gripper]
+    opening: float  # of an open gripper [m]
+    home: np.ndarray  # both arms, left first (n + m,)
+
+    def __init__(self, description: RobotDescription, model: Model):
+        """Raises ConfigError in one line that names the key: what the model lacks or contradicts."""
+        d, plant, index = description, model.plant, model.robot
+        joint = {key: joint_named(plant, index, name, key) for key, name in named_joints(d)}
+        self.description, self.model = d, model
+        self.opening = d.opening
+        frame = frame_named(plant, index, d.base.frame, "base.frame")
+        self.base = _base(plant, index, d, frame)
+        lift = [joint[f"lift.joints[{k}]"] for k in range(len(d.lift.joints))]
+        gaze = {key: joint[f"gaze.{key}"] for key in ("waist", "tilt", "pan") if f"gaze.{key}" in joint}
+        held = [*lift, *(gaze[key] for key in ("waist",) if key in gaze)]
+        rest = [*d.lift.home, *(0.0 for key in ("waist",) if key in gaze)]
+        speed = [*d.lift.speed, *(d.gaze.speed for key in ("waist",) if key in gaze)]
+        head = [gaze["tilt"], gaze["pan"]]
+        self.posture = _joints(held, speed, rest)
+        self.torso = _joints([*held, *head], [*speed, d.gaze.speed, d.gaze.speed], [*rest, 0.0, 0.0])
+        _check_within(self.posture, "lift.home")
+        self.arms = MappingProxyType({side: _arm(plant, index, d, side, joint) for side in SIDES})
+        self.home = _locked(np.concatenate([self.arms[side].home for side in SIDES]))
+
+        self._plant, self._base_frame = plant, frame
+        self._mimics = _followers(plant, index, model.mimics)
+        self._context = plant.CreateDefaultContext()
+        self._eye = frame_named(plant, index, d.cameras["head_left"], "cameras.head_left")
+        for name, camera in d.cameras.items():
+            if camera:
+                frame_named(plant, index, camera, f"cameras.{name}")
+        self._torso_q = _positions([*held, *head])
+        self._posture_q = self._torso_q[: len(held)]
+        q = np.array(plant.GetPositions(self._context))
+        q[self._torso_q] = self.torso.home
+        for side in SIDES:
+            q[_positions([joint[f"arms.{side}.joints[{k}]"] for k in range(len(self.arms[side]))])] = self.arms[
+                side
+            ].home
+        self._home_q = q
+        self._chains = {side: self._chain(side, joint) for side in SIDES}
+        self._check_sides()
+        self._check_gaze()
+        self.grippers = MappingProxyType({side: self._gripper(side, joint[f"grippers.{side}.joint"]) for side in SIDES})
+        for side in SIDES:
+            q[joint[f"grippers.{side}.joint"].position_start()] = self.grippers[side].position(d.opening)
+        self._follow(q)
+        self.hands = MappingProxyType({side: self._hand(side) for side in SIDES})
+        self._scratch = q.copy()
+        for name in ("_home_q", "_torso_q", "_posture_q"):
+            _locked(getattr(self, name))
+        self._frozen = True
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if getattr(self, "_frozen", False):
+            raise AttributeError(f"a robot does not change: {name}")
+        super().__setattr__(name, value)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Robot":
+        return self
+
+    @staticmethod
+    def load(path: str | Path) -> "Robot":
+        """The robot of a robot.yaml; made once for equal files. Raises ConfigError in one line."""
+        return Robot.of(descriptions.load(path), str(path))
+
+    @staticmethod
+    def of(description: RobotDescription, source: str) -> "Robot":
+        """The robot of a loaded description; made once for equal ones. Raises ConfigError in one line.
+
+        source: named in errors.
+        """
+        file = descriptions.model_file(description)
+        state = file.stat()
+        key = (repr(description), str(file), state.st_mtime_ns, state.st_size)
+        if key not in _loaded:
+            try:
+                _loaded[key] = Robot(description, make_model(description))
+            except ConfigError as error:
+                raise ConfigError(f"{source}: {error}") from error
+            while len(_loaded) > _KEPT:
+                _loaded.pop(next(iter(_loaded)))
+        return _loaded[key]
+
+    # ------------------------------------------------------------ head
+    def X_BL(self, torso: np.ndarray) -> np.ndarray:
+        """The left eye in the base for the torso's joints -> (3, 4)."""
+        q = self._home_q.copy()
+        q[self._torso_q] = torso
+        self._plant.SetPositions(self._context, q)
+        return self._pose(self._eye)
+
+    def head_pose(self, base: np.ndarray, torso: np.ndarray) -> np.ndarray:
+        """X_OL for base = (x, y, heading) in O -> (3, 4)."""
+        return compose(planar(*base), self.X_BL(torso))
+
+    # ------------------------------------------------------------ arms
+    def split(self, q: np.ndarray) -> dict[str, np.ndarray]:
+        """Both arms' joints (n + m,), left first -> by side."""
+        n = len(self.arms[LEFT])
+        return {LEFT: q[:n], RIGHT: q[n:]}
+
+    def forward(self, side: str, q: np.ndarray, posture: np.ndarray | None = None) -> np.ndarray:
+        """X_BG of a hand for its arm's joints (n,) -> (3, 4). posture: lift and waist; None: at home."""
+        chain = self._chains[side]
+        self._set(chain, q, posture)
+        return self._pose(chain.grip)
+
+    def jacobian(self, side: str, q: np.ndarray, posture: np.ndarray | None = None) -> np.ndarray:
+        """J with V_BG = J q' ([w; v] of the grip point, in B) -> (6, n)."""
+        chain = self._chains[side]
+        self._set(chain, q, posture)
+        return self._jacobian(chain)
+
+    def inverse(
+        self, side: str, X_BG: np.ndarray, near: np.ndarray | None = None, posture: np.ndarray | None = None
+    ) -> np.ndarray | None:
+        """Joints (n,) within their limits that bring the hand to X_BG within 1e-6 rad and m; None if out of reach.
+
+        near: the solution that continues this pose; None: any, with a good margin where there is one.
+        """
+        chain, arm = self._chains[side], self.arms[side]
+        if not np.isfinite(X_BG).all() or (near is not None and not np.isfinite(near).all()):
+            return None
+        self._set(chain, arm.home, posture)
+        if near is None:
+            far = X_BG[:, 3] - self._pose(chain.shoulder)[:, 3]
+            if math.sqrt(far @ far) > chain.reach:
+                return None
+        plant, context, scratch, slots = self._plant, self._context, self._scratch, chain.q
+
+        def evaluate(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            scratch[slots] = q
+            plant.SetPositions(context, scratch)
+            return self._pose(chain.grip), self._jacobian(chain)
+
+        if near is not None:
+            return kinematics.solve(evaluate, X_BG, near, arm)
+
+        def margin(q: np.ndarray) -> float:
+            return kinematics.margin(q, evaluate(q)[1], arm)
+
+        return kinematics.search(evaluate, X_BG, arm, kinematics.seeds(arm), margin)
+
+    def margin(self, side: str, q: np.ndarray) -> float:
+        """Of an arm from its limits and singularities: 1 is comfortable, 0 at a limit, negative beyond."""
+        return kinematics.margin(q, self.jacobian(side, q), self.arms[side])
+
+    # ------------------------------------------------------------ for who has a Context of his own
+    def slots(self, joints: Sequence[str]) -> np.ndarray:
+        """Where these joints' positions stand in the positions of the model's plant."""
+        return _positions([joint_named(self._plant, self.model.robot, name, "joint") for name in joints])
+
+    def rest(self, opening: float) -> np.ndarray:
+        """The positions of the model's plant with all joints at home and both grippers so far open [m]."""
+        q = self._home_q.copy()
+        for gripper in self.grippers.values():
+            q[self.slots([gripper.joint])] = gripper.position(opening)
+        self._follow(q)
+        return q
+
+    # ------------------------------------------------------------ scratch
+    def _set(self, chain: _Chain, q: np.ndarray, posture: np.ndarray | None) -> None:
+        scratch = self._scratch
+        scratch[:] = self._home_q
+        scratch[chain.q] = q
+        if posture is not None:
+            scratch[self._posture_q] = posture
+        self._plant.SetPositions(self._context, scratch)
+
+    def _pose(self, frame: Frame) -> np.ndarray:
+        """X_BF as the context stands -> (3, 4)."""
+        X: np.ndarray = self._plant.CalcRelativeTransform(self._context, self._base_frame, frame).GetAsMatrix34()
+        return X
+
+    def _jacobian(self, chain: _Chain) -> np.ndarray:
+        B = self._base_frame
+        J: np.ndarray = self._plant.CalcJacobianSpatialVelocity(
+            self._context, JacobianWrtVariable.kV, chain.grip, _ORIGIN, B, B
+        )
+        return J[:, chain.v]
+
+    def _follow(self, q: np.ndarray) -> None:
+        """Puts the joints that follow others where they belong, in the plant's positions."""
+        for follower, leader, multiplier, offset in self._mimics:
+            q[follower] = multiplier * q[leader] + offset
+
+    # ------------------------------------------------------------ read off the model, once
+    def _chain(self, side: str, joint: Mapping[str, Joint]) -> _Chain:
+        plant, index = self._plant, self.model.robot
+        grip = frame_named(plant, index, f"{side}_grip", f"frames.{side}_grip")
+        joints = [joint[f"arms.{side}.joints[{k}]"] for k in range(len(self.arms[side]))]
+        carried = _carriers(plant, index, grip)
+        for k, inner in enumerate(joints):
+            if inner not in carried:
+                raise ConfigError(f"arms.{side}.joints[{k}] must carry {side}_grip, got {shown(inner.name())}")
+        order = sorted(joints, key=carried.index, reverse=True)
+        if order != joints:
+            names = ", ".join(inner.name() for inner in order)
+            raise ConfigError(f"arms.{side}.joints must go from the shoulder outwards: {names}")
+        self._plant.SetPositions(self._context, self._home_q)
+        points = [self._pose(inner.frame_on_parent())[:, 3] for inner in joints] + [self._pose(grip)[:, 3]]
+        lengths = [float(np.linalg.norm(b - a)) for a, b in zip(points, points[1:])]
+        slides = [inner.position_upper_limits()[0] - inner.position_lower_limits()[0] for inner in joints
+                  if isinstance(inner, PrismaticJoint)]  # fmt: skip
+        return _Chain(
+            _positions(joints),
+            np.array([inner.velocity_start() for inner in joints]),
+            grip,
+            joints[0].frame_on_parent(),
+            sum(lengths) + float(sum(slides)) + 1e-6,
+        )
+
+    def _check_sides(self) -> None:
+        self._plant.SetPositions(self._context, self._home_q)
+        left, right = (self._pose(self._chains[side].shoulder)[1, 3] for side in SIDES)
+        if left <= right:
+            raise ConfigError(
+                f"arms.left must be to the left of arms.right, got shoulders at y = {left:.3g} and {right:.3g} m"
+            )
+
+    def _check_gaze(self) -> None:
+        """Tilt looks down where it grows, pan to the left."""
+        for key, slot, row, sign, words in (("tilt", -2, 2, -1.0, "down"), ("pan", -1, 1, 1.0, "to the left")):
+            torso = self.torso.home.copy()
+            torso[slot] += 0.1
+            moved = self.X_BL(torso)[row, 2] - self.X_BL(self.torso.home)[row, 2]
+            require(
+                sign * moved > 0.01, f"gaze.{key}", f"a joint that looks {words} where it grows", self.torso.names[slot]
+            )
+
+    def _gripper(self, side: str, joint: Joint) -> Gripper:
+        """Opening over position, from the pads' distance along the closing direction; shut is the least."""
+        plant, index, key = self._plant, self.model.robot, f"grippers.{side}"
+        spec = self.description.gripper(side)
+        pads = [frame_named(plant, index, pad, f"{key}.pads[{k}]") for k, pad in enumerate(spec.pads)]
+        grip = self._chains[side].grip
+        low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        require(math.isfinite(low) and low < high < math.inf, f"{key}.joint", "a joint with limits", joint.name())
+        at = np.array(self.description.pad.at)
+        positions, distances = np.linspace(low, high, _OPENINGS), []
+        q = self._home_q.copy()
+        for position in positions:
+            q[joint.position_start()] = position
+            self._follow(q)
+            plant.SetPositions(self._context, q)
+            points = [plant.CalcPointsPositions(self._context, pad, at, grip)[1, 0] for pad in pads]
+            distances.append(points[0] - points[1])
+        openings = np.array(distances)
+        openings *= 1.0 if abs(openings.max()) >= abs(openings.min()) else -1.0
+        if openings[0] > openings[-1]:
+            positions, openings = positions[::-1], openings[::-1]
+        if not np.all(np.diff(openings) > 0):
+            raise ConfigError(f"{key}.joint must open and shut the pads, got {shown(joint.name())}")
+        most, wanted = float(openings[-1]), self.description.opening
+        require(wanted <= most + _TOUCH, "opening", f"at most {most:.4g} m, which the {side} gripper opens", wanted)
+        return Gripper(joint.name(), _locked(positions), _locked(openings))
+
+    def _hand(self, side: str) -> HandLoad:
+        """Mass and centre of mass of all bodies beyond the sensor, grippers open, in the sensor's frame."""
+        plant, index, d = self._plant, self.model.robot, self.description
+        key, name, chain = f"arms.{side}.sensor", d.arm(side).sensor, self._chains[side]
+        if name == TORQUE:
+            raise ConfigError(f"{key}: torque is not supported yet; name a fixed joint between arm and hand")
+        sensor = joint_named(plant, index, name, key)
+        carried = _carriers(plant, index, chain.grip)
+        last = self.arms[side].names[-1]
+        beyond = sensor in carried and any(joint.name() == last for joint in carried[carried.index(sensor) :])
+        good = sensor.type_name() == "weld" and beyond
+        require(good, key, f"a fixed joint between {last} and {side}_grip", name)
+        q = self._home_q.copy()
+        for other in SIDES:
+            joint = joint_named(plant, index, d.gripper(other).joint, "")
+            q[joint.position_start()] = self.grippers[other].position(d.opening)
+        self._follow(q)
+        plant.SetPositions(self._context, q)
+        frame = sensor.frame_on_child()
+        X_SG = plant.CalcRelativeTransform(self._context, frame, chain.grip).GetAsMatrix34()
+        bodies = [plant.get_body(i) for i in plant.GetBodyIndices(index)]
+        mass, moment = 0.0, np.zeros(3)
+        for body in bodies:
+            if sensor in _carriers(plant, index, body.body_frame()):
+                own = body.default_mass()
+                com = body.CalcCenterOfMassInBodyFrame(self._context)
+                mass += own
+                moment += own * plant.CalcPointsPositions(self._context, body.body_frame(), com, frame)[:, 0]
+        require(mass > 0, key, "a joint with a mass beyond it", name)
+        weight = 0.0 if d.counterbalanced else mass
+        return HandLoad(weight, _locked(np.round(moment / mass, 12)), _locked(np.round(X_SG, 12)))  # to the picometer
+
+
+_KEPT = 8  # robots that `load` remembers
+_loaded: dict[tuple[Any, ...], Robot] = {}
+
+
+def _locked(array: np.ndarray) -> np.ndarray:
+    array.setflags(write=False)
+    return array
+
+
+def _positions(joints: list[Joint]) -> np.ndarray:
+    return np.array([joint.position_start() for joint in joints], int)
+
+
+def _joints(joints: list[Joint], speed: list[float], home: list[float]) -> Joints:
+    return Joints(**_group(joints, speed, home))
+
+
+def _group(joints: list[Joint], speed: list[float], home: list[float]) -> dict[str, Any]:
+    return {
+        "names": tuple(joint.name() for joint in joints),
+        "low": _locked(np.array([joint.position_lower_limits()[0] for joint in joints])),
+        "high": _locked(np.array([joint.position_upper_limits()[0] for joint in joints])),
+        "speed": _locked(np.array(speed, float)),
+        "home": _locked(np.array(home, float)),
+    }
+
+
+def _check_within(group: Joints, key: str, values: np.ndarray | None = None) -> None:
+    for k, value in enumerate(group.home if values is None else values):
+        low, high = group.low[k], group.high[k]
+        require(
+            low <= value <= high, f"{key}[{k}]", f"within [{low:g}, {high:g}], {group.names[k]}'s limits", float(value)
+        )
+
+
+def _base(plant: MultibodyPlant, index: ModelInstanceIndex, d: RobotDescription, frame: Frame) -> Joints:
+    chain = base_chain(plant, index, frame.body())
+    kinds = [joint.type_name() for joint in chain]
+    if d.base.drive == "fixed":
+        require(not chain, "base.drive", f"one that moves: {', '.join(j.name() for j in chain)} move the base", "fixed")
+        return _joints([], [], [])
+    good = kinds == ["prismatic", "prismatic", "revolute"]
+    require(good, "base.frame", "moved by two prismatic and one revolute joint of the model, or by none", d.base.frame)
+    speed = d.base.speed
+    return _joints(chain, [speed[0], speed[-2], speed[-1]], [0.0, 0.0, 0.0])
+
+
+def _arm(
+    plant: MultibodyPlant, index: ModelInstanceIndex, d: RobotDescription, side: str, joint: Mapping[str, Joint]
+) -> Arm:
+    spec = d.arm(side)
+    joints = [joint[f"arms.{side}.joints[{k}]"] for k in range(len(spec.joints))]
+    work = _locked(np.array(spec.work or spec.home))
+    arm = Arm(**_group(joints, d.arm_speed, spec.home), work=work)
+    _check_within(arm, f"arms.{side}.home")
+    _check_within(arm, f"arms.{side}.work", work)
+    return arm
+
+
+def _carriers(plant: MultibodyPlant, index: ModelInstanceIndex, frame: Frame) -> list[Joint]:
+    """The joints that carry a frame, the nearest first."""
+    out: list[Joint] = []
+    body = frame.body()
+    while (joint := parent_joint(plant, index, body)) is not None:
+        out.append(joint)
+        body = joint.parent_body()
+    return out
+
+
+def _followers(
+    plant: MultibodyPlant, index: ModelInstanceIndex, mimics: tuple[Mimic, ...]
+) -> list[tuple[int, int, float, float]]:
+    def slot(name: str) -> int:
+        start: int = joint_named(plant, index, name, "model: mimic").position_start()
+        return start
+
+    return [(slot(m.joint), slot(m.follows), m.multiplier, m.offset) for m in mimics]
