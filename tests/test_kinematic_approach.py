@@ -456,7 +456,8 @@ def test_where_the_straight_line_is_blocked_the_hands_move_straight_back_from_th
             assert moved == pytest.approx([0, OUTWARD[side] * back / 2, 0], abs=2e-6)  # and a little outwards
             assert X1[:, :3] == pytest.approx(X0[:, :3], abs=2e-6)
     middle = (start + goal) / 2
-    bench.law.is_free = lambda X_BV, q: bool(np.abs(q - middle).max() > 0.08)
+    free = lambda X_BV, q: bool(np.abs(q - middle).max() > 0.08)  # noqa: E731
+    bench.law.stances = dc.replace(bench.law.stances, is_free=free)
     bench.run(Mode.IDLE, limit=0.1)
     bench.memory = dc.replace(bench.memory, q=start, path=None)
     bench.run(Mode.FOLD if homewards else Mode.REACH)

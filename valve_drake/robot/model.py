@@ -83,14 +83,8 @@ def add_robot(plant: MultibodyPlant, robot: RobotDescription) -> ModelInstanceIn
     path = model_file(robot)
     model = parse(plant, path)
     efforts = {name: effort for name, effort, _ in _file_joints(path) if effort is not None}
-    for k, name in enumerate(robot.weld):
-        joint = joint_named(plant, model, name, f"weld[{k}]")
-        parent, child = joint.frame_on_parent(), joint.frame_on_child()
-        try:
-            plant.RemoveJoint(joint)
-        except RuntimeError as error:
-            raise ConfigError(f"weld[{k}]: {shown(name)} cannot be welded: {_first(str(error))}") from error
-        plant.WeldFrames(parent, child)
+    if robot.weld:
+        _weld(plant, model, robot)
     for name, frame in robot.frames.items():
         if plant.HasFrameNamed(name, model):
             raise ConfigError(f"frames.{name}: the model has a frame of this name")
@@ -109,6 +103,32 @@ def add_robot(plant: MultibodyPlant, robot: RobotDescription) -> ModelInstanceIn
     if robot.counterbalanced:
         plant.set_gravity_enabled(model, False)
     return model
+
+
+def _weld(plant: MultibodyPlant, model: ModelInstanceIndex, robot: RobotDescription) -> None:
+    """Drake removes no joint while the plant has constraints: they are taken out and put back."""
+    followers = mimics(robot)
+    constraints = plant.GetConstraintIds()
+    known = sum(mimic is not None for _, _, mimic in _file_joints(model_file(robot)))
+    if len(constraints) > known:
+        raise ConfigError("weld must be empty for a model with constraints other than mimics")
+    for constraint in constraints:
+        plant.RemoveConstraint(constraint)
+    for k, name in enumerate(robot.weld):
+        joint = joint_named(plant, model, name, f"weld[{k}]")
+        parent, child = joint.frame_on_parent(), joint.frame_on_child()
+        for index in plant.GetJointActuatorIndices():
+            actuator = plant.get_joint_actuator(index)
+            if actuator.joint().index() == joint.index():
+                plant.RemoveJointActuator(actuator)
+        try:
+            plant.RemoveJoint(joint)
+        except RuntimeError as error:
+            raise ConfigError(f"weld[{k}]: {shown(name)} cannot be welded: {_first(str(error))}") from error
+        plant.WeldFrames(parent, child)
+    for mimic in followers:
+        pair = [joint_named(plant, model, name, f"mimic of {mimic.joint}") for name in (mimic.joint, mimic.follows)]
+        plant.AddCouplerConstraint(*pair, mimic.multiplier, mimic.offset)
 
 
 def named_joints(robot: RobotDescription) -> Iterator[tuple[str, str]]:

@@ -402,7 +402,10 @@ def _check_within(group: Joints, key: str, values: np.ndarray | None = None) -> 
     for k, value in enumerate(group.home if values is None else values):
         low, high = group.low[k], group.high[k]
         require(
-            low <= value <= high, f"{key}[{k}]", f"within [{low:g}, {high:g}], {group.names[k]}'s limits", float(value)
+            low <= value <= high,
+            f"{key}[{k}]",
+            f"within [{low:g}, {high:g}], the limits of {group.names[k]}",
+            float(value),
         )
 
 

@@ -1,0 +1,80 @@
+"""Other robots for the tests: our own, its model and its robot.yaml edited."""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from valve_drake import resources, yaml_file
+from valve_drake.messages import SIDES
+from valve_drake.robot import description
+
+ElementTree.register_namespace("drake", "drake.mit.edu")
+Model = ElementTree.Element
+Edit = Callable[[Model], None]
+Change = Callable[[dict[str, Any]], None]
+
+
+def variant(folder: Path, edit: Edit = lambda model: None, change: Change = lambda given: None) -> Path:
+    """The robot.yaml of our robot with its SDF model `edit`ed and its keys `change`d, in a folder."""
+    source = description.find(description.OURS)
+    tree = ElementTree.parse(source.with_name("robot.sdf"))
+    model = tree.getroot().find("model")
+    assert model is not None
+    for uri in model.iter("uri"):
+        uri.text = (uri.text or "").replace("../meshes", "package://valve_drake_models/meshes")
+    edit(model)
+    given = yaml_file.read(source)
+    for name in ("head_calibration", "taught"):
+        given[name] = str(resources.models() / given[name].removeprefix("../"))
+    change(given)
+    folder.mkdir(parents=True, exist_ok=True)
+    tree.write(folder / "robot.sdf", encoding="unicode")
+    path = folder / "robot.yaml"
+    path.write_text(yaml_file.dump(given))
+    return path
+
+
+def part(model: Model, kind: str, name: str) -> Model:
+    """The link, joint or frame of this name."""
+    return next(element for element in model.iter(kind) if element.get("name") == name)
+
+
+def put(element: Model, path: str, text: str) -> None:
+    found = element.find(path)
+    assert found is not None, path
+    found.text = text
+
+
+def seven_joints(model: Model) -> None:
+    """A roll joint in the middle of each upper arm."""
+    for side in SIDES:
+        arm, roll = f"{side}_upper_arm", f"{side}_upper_arm_roll"
+        model.append(
+            ElementTree.fromstring(f"""<link name="{roll}"><pose relative_to="{arm}">0.18 0 0 0 0 0</pose><inertial>
+            <mass>0.3</mass><inertia><ixx>1e-3</ixx><iyy>1e-3</iyy><izz>1e-3</izz></inertia></inertial></link>""")
+        )
+        model.append(
+            ElementTree.fromstring(f"""<joint name="{side}_arm_roll" type="revolute"><parent>{arm}</parent>
+            <child>{roll}</child><axis><xyz>1 0 0</xyz><limit><lower>-2.8</lower><upper>2.8</upper><effort>100</effort>
+            <velocity>2.5</velocity></limit></axis></joint>""")
+        )
+        put(part(model, "joint", f"{side}_arm_3"), "parent", roll)
+
+
+def with_roll(given: dict[str, Any]) -> None:
+    for side in SIDES:
+        arm = given["arms"][side]
+        arm["joints"].insert(2, f"{side}_arm_roll")
+        for name in ("home", "work"):
+            arm[name].insert(2, 0.0)
+    given["arm_speed"].insert(2, 1.2)
+
+
+def crooked_wrist(model: Model) -> None:
+    """Other lengths, and wrist axes that do not meet."""
+    for side in SIDES:
+        put(part(model, "link", f"{side}_forearm"), "pose", "0.40 0 0 0 0 0")
+        put(part(model, "link", f"{side}_wrist_1"), "pose", "0.29 0 0.03 0 0 0")
+        put(part(model, "link", f"{side}_wrist_2"), "pose", "0.03 0 -0.03 0 0 0")
+        put(part(model, "link", f"{side}_wrist_3"), "pose", "0.02 0.02 0.01 0 0 0")

@@ -1,0 +1,343 @@
+"""robot.yaml and the robot that is made of it: names, limits, loads, gripper, and one line for whatever is wrong."""
+
+import re
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import MultibodyPlant
+from robot_facts import MIRROR, ROBOT
+from robot_variants import part, put, seven_joints, variant, with_roll
+
+from valve_drake import cli, yaml_file
+from valve_drake.checks import ConfigError
+from valve_drake.diagram import make_blocks
+from valve_drake.frames import compose, make, planar, rot_z
+from valve_drake.messages import LEFT, RIGHT, SIDES
+from valve_drake.robot import description, model
+from valve_drake.robot.robot import Robot
+from valve_drake.scenario import load
+
+OURS = description.find(description.OURS)
+
+# ---------------------------------------------------------------- our own robot
+
+
+def test_groups_limits_and_speeds_are_those_of_the_files():
+    assert ROBOT.base.names == ("base_x", "base_y", "base_yaw")
+    assert ROBOT.posture.names == ("waist",)
+    assert ROBOT.torso.names == ("waist", "neck_pitch", "neck_yaw")
+    assert (ROBOT.torso.low.tolist(), ROBOT.torso.high.tolist()) == ([-0.6, -0.5, -1.6], [0.6, 1.1, 1.6])
+    for side in SIDES:
+        arm = ROBOT.arms[side]
+        assert arm.names == tuple(f"{side}_arm_{k}" for k in range(1, 7))
+        assert arm.high.tolist() == (-arm.low).tolist() == [2.97, 2.09, 2.62, 3.32, 2.09, 3.14]
+        assert arm.speed.tolist() == ROBOT.description.arm_speed
+    assert ROBOT.arms[RIGHT].home.tolist() == (ROBOT.arms[LEFT].home * MIRROR).tolist()
+    assert np.array_equal(ROBOT.home, np.concatenate([ROBOT.arms[side].home for side in SIDES]))
+    assert [part.tolist() for part in ROBOT.split(np.arange(12.0)).values()] == [list(range(6)), list(range(6, 12))]
+
+
+def test_the_arms_at_zero_point_straight_forward():
+    for side, y in ((LEFT, 0.2), (RIGHT, -0.2)):
+        X = ROBOT.forward(side, np.zeros(6))
+        assert X == pytest.approx(make(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([0.94, y, 1.05])))
+        turned = ROBOT.forward(side, np.zeros(6), posture=np.array([0.3]))  # the waist turns all of it
+        assert turned == pytest.approx(compose(make(rot_z(0.3), np.zeros(3)), X))
+
+
+def test_the_eye_is_where_the_model_has_it_and_turns_with_waist_and_neck():
+    R = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    assert ROBOT.X_BL(np.zeros(3)) == pytest.approx(make(R, np.array([0.02, 0.06, 1.42])))
+    assert ROBOT.X_BL(np.array([0.2, 0, 0])) == pytest.approx(
+        compose(make(rot_z(0.2), np.zeros(3)), ROBOT.X_BL(np.zeros(3)))
+    )
+    down = ROBOT.X_BL(np.array([0, 0.3, 0]))[:, 2]
+    assert down == pytest.approx([np.cos(0.3), 0, -np.sin(0.3)])
+    base = np.array([1.0, -2.0, 0.4])
+    assert ROBOT.head_pose(base, np.zeros(3)) == pytest.approx(compose(planar(*base), ROBOT.X_BL(np.zeros(3))))
+
+
+def test_a_wrist_sensor_carries_all_that_is_beyond_it():
+    """0.7 kg of hand at (8, 0, 28) mm, two fingers of 80 g each at 0.14 - 0.03 m, even to both sides."""
+    for side, sign in ((LEFT, 1), (RIGHT, -1)):
+        hand = ROBOT.hands[side]
+        assert hand.mass == pytest.approx(0.86)
+        com = (0.7 * np.array([sign * 0.008, 0, 0.028]) + 2 * 0.08 * np.array([0, 0, 0.11])) / 0.86
+        assert hand.p_SCom == pytest.approx(com, abs=1e-9)
+        assert hand.X_SG == pytest.approx(make(np.eye(3), np.array([0, 0, 0.14])), abs=1e-12)
+
+
+def test_the_opening_is_twice_the_fingers_way():
+    for side in SIDES:
+        gripper = ROBOT.grippers[side]
+        assert gripper.opening(0.0) == pytest.approx(0) and gripper.opening(0.04) == pytest.approx(0.08)
+        assert gripper.position(0.085) == pytest.approx(0.0425)
+    rest = ROBOT.rest(0.06)
+    assert rest[ROBOT.slots([f"{side}_finger_{k}" for side in SIDES for k in (1, 2)])] == pytest.approx(0.03)
+
+
+def test_a_robot_does_not_change_and_is_made_once():
+    assert Robot.load(OURS) is ROBOT
+    with pytest.raises(AttributeError):
+        ROBOT.opening = 0.1
+    for array in (ROBOT.home, ROBOT.arms[LEFT].low, ROBOT.arms[LEFT].work, ROBOT.hands[LEFT].X_SG):
+        with pytest.raises(ValueError):
+            array[...] = 0
+
+
+def test_a_file_that_has_changed_is_another_robot(tmp_path):
+    path = variant(tmp_path)
+    first = Robot.load(path)
+    assert Robot.load(path) is first
+    path = variant(tmp_path, lambda m: put(part(m, "link", "left_forearm"), "pose", "0.40 0 0 0 0 0"))
+    assert Robot.load(path).forward(LEFT, np.zeros(6))[0, 3] == pytest.approx(0.98)
+
+
+def test_a_description_can_be_kept_and_read_anywhere(tmp_path):
+    kept = tmp_path / "kept.yaml"
+    kept.write_bytes(description.text(OURS))
+    assert description.load(kept) == description.load(OURS)
+    assert description.load(OURS).model == "package://valve_drake_models/robot/robot.sdf"
+    other = variant(tmp_path / "other")
+    kept.write_bytes(description.text(other))
+    assert description.load(kept).model == str(other.with_name("robot.sdf"))
+
+
+# ---------------------------------------------------------------- what other robots have
+
+
+def test_planar_joints_are_added_to_a_model_that_has_none(tmp_path):
+    def edit(m):
+        for kind, name in (("joint", "base_x"), ("joint", "base_y"), ("joint", "base_yaw"),
+                           ("link", "base_x_carriage"), ("link", "base_y_carriage")):  # fmt: skip
+            m.remove(part(m, kind, name))
+
+    robot = Robot.load(variant(tmp_path, edit))
+    assert robot.base.names == ("base_x", "base_y", "base_yaw")
+    assert robot.forward(LEFT, np.zeros(6)) == pytest.approx(ROBOT.forward(LEFT, np.zeros(6)))
+    plant = robot.model.plant
+    context = plant.CreateDefaultContext()
+    q = plant.GetPositions(context)
+    q[robot.slots(robot.base.names)] = [1.0, 2.0, 0.5]
+    plant.SetPositions(context, q)
+    X = plant.GetFrameByName("B").CalcPoseInWorld(context).GetAsMatrix34()
+    assert X == pytest.approx(planar(1.0, 2.0, 0.5))
+    assert all(plant.HasJointActuatorNamed(name) for name in robot.base.names)
+
+
+def test_joints_without_actuators_get_them_with_the_files_effort(tmp_path):
+    robot = Robot.load(variant(tmp_path, seven_joints, with_roll))
+    plant = robot.model.plant
+    assert plant.GetJointActuatorByName("left_arm_roll").effort_limit() == 100
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(
+        '<robot name="a"><link name="l"/><joint name="j" type="revolute"><limit effort="7" lower="0" upper="1"'
+        ' velocity="1"/><mimic joint="i" multiplier="-2" offset="0.1"/></joint></robot>'
+    )
+    assert list(model._file_joints(urdf)) == [("j", 7.0, model.Mimic("j", "i", -2.0, 0.1))]
+
+
+def test_welded_joints_hold_where_they_are_zero(tmp_path):
+    def weld(given):
+        given["weld"] = ["left_arm_roll", "right_arm_roll"]
+
+    robot = Robot.load(variant(tmp_path, seven_joints, weld))
+    q = ROBOT.arms[LEFT].home
+    assert robot.forward(LEFT, q) == pytest.approx(ROBOT.forward(LEFT, q))
+    assert not robot.model.plant.HasJointNamed("left_arm_roll")
+
+
+def test_added_frames_are_frames_of_the_model(tmp_path):
+    def edit(m):
+        m.remove(part(m, "frame", "left_grip"))
+
+    def change(given):
+        given["frames"] = {"left_grip": {"link": "left_hand", "xyz": [0, 0, 0.14], "rpy": [0, 0, 0]}}
+
+    robot = Robot.load(variant(tmp_path, edit, change))
+    assert robot.forward(LEFT, np.zeros(6)) == pytest.approx(ROBOT.forward(LEFT, np.zeros(6)))
+
+
+def test_a_counterbalanced_robot_has_no_weight(tmp_path):
+    robot = Robot.load(variant(tmp_path, change=lambda given: given.update(counterbalanced=True)))
+    assert robot.hands[LEFT].mass == 0
+    assert not robot.model.plant.is_gravity_enabled(robot.model.robot)
+
+
+def test_the_same_robot_can_be_added_to_any_plant():
+    plant = MultibodyPlant(1e-3)
+    index = model.add_robot(plant, ROBOT.description)
+    plant.Finalize()
+    assert plant.num_positions(index) == 3 + 3 + 12 + 4
+
+
+def rotary(m):
+    """Fingers that swing about pivots 90 mm behind their pads."""
+    for side in SIDES:
+        for k, x in ((1, -1), (2, 1)):
+            joint = part(m, "joint", f"{side}_finger_{k}")
+            joint.set("type", "revolute")
+            put(joint, "axis/xyz", f"{x} 0 0")
+            put(joint, "axis/limit/upper", "0.55")
+            put(part(m, "link", f"{side}_finger_{k}_link"), "pose", "0 0 0.05 0 0 0")
+
+
+def test_a_rotary_gripper_opens_by_the_sine_of_its_joint(tmp_path):
+    robot = Robot.load(variant(tmp_path, rotary, lambda given: given.update(pad={"at": [0, 0, 0.09]})))
+    for angle in (0.0, 0.2, 0.5):
+        assert robot.grippers[LEFT].opening(angle) == pytest.approx(2 * 0.09 * np.sin(angle), abs=2e-5)
+        assert robot.grippers[LEFT].position(2 * 0.09 * np.sin(angle)) == pytest.approx(angle, abs=2e-4)
+
+
+def test_a_gripper_whose_joint_falls_as_it_opens(tmp_path):
+    def edit(m):
+        for side in SIDES:
+            for k, y in ((1, -1), (2, 1)):
+                joint = part(m, "joint", f"{side}_finger_{k}")
+                put(joint, "axis/xyz", f"0 {y} 0")
+                put(joint, "axis/limit/lower", "-0.045")
+                put(joint, "axis/limit/upper", "0")
+
+    gripper = Robot.load(variant(tmp_path, edit)).grippers[RIGHT]
+    assert gripper.opening(-0.03) == pytest.approx(0.06) and gripper.position(0.06) == pytest.approx(-0.03)
+
+
+# ---------------------------------------------------------------- wrong files
+
+
+def at(path, value):
+    """A change of one key, given as "arms.left.home"."""
+
+    def change(given):
+        *inner, last = path.split(".")
+        for name in inner:
+            given = given[name]
+        given[last] = value
+
+    return change
+
+
+def swapped(given):
+    given["arms"]["left"]["joints"], given["arms"]["right"]["joints"] = (
+        given["arms"]["right"]["joints"],
+        given["arms"]["left"]["joints"],
+    )
+
+
+WRONG = {
+    "an unknown key": (at("wheels", 4), "unknown key wheels; known here: arm_speed"),
+    "a key that is missing": (lambda given: given.pop("base"), "base.frame must be given, got ''"),
+    "no model": (at("model", ""), "model must be given"),
+    "a model that is not there": (at("model", "nobody.urdf"), "model: no such file: 'nobody.urdf'"),
+    "a package that is not there": (at("model", "package://pr9/a.urdf"), "model: no package 'pr9' in ROS_PACKAGE_PATH"),
+    "a file that is not in its package": (
+        at("model", "package://valve_drake_models/a.urdf"),
+        "model: no such file: 'package://valve_drake_models/a.urdf'",
+    ),
+    "a model that is none": (at("model", "robot.yaml"), "model "),
+    "an unknown joint": (
+        at("gaze.pan", "neck_yaws"),
+        "gaze.pan must be a joint of the model, got 'neck_yaws'; near it: neck_yaw",
+    ),
+    "an unknown frame": (
+        at("cameras.head_left", "head_camera"),
+        "cameras.head_left must be a frame of the model, got 'head_camera'; near it: head",
+    ),
+    "an unknown base frame": (at("base.frame", "footprint"), "base.frame must be a frame of the model"),
+    "an unknown link below a frame": (at("frames", {"tool": {"link": "lefthand"}}), "frames.tool.link must be a frame"),
+    "a frame that is there": (at("frames", {"left_grip": {"link": "left_hand"}}), "frames.left_grip: the model has"),
+    "home beyond a limit": (
+        at("arms.left.home", [1.05, 0.65, -2.9, 0, 1.25, 0]),
+        "arms.left.home[2] must be within [-2.62, 2.62], the limits of left_arm_3, got -2.9",
+    ),
+    "work beyond a limit": (at("arms.right.work", [9, 0, 0, 0, 0, 0]), "arms.right.work[0] must be within [-2.97, "),
+    "too few values": (at("arms.left.home", [0, 0]), "arms.left.home must be one value for each of 6 joints"),
+    "speeds of another arm": (at("arm_speed", [1.0] * 7), "arm_speed must be one value for each of 6 joints"),
+    "left and right mixed": (swapped, "arms.left.joints[0] must carry left_grip, got 'right_arm_1'"),
+    "joints from the hand inwards": (
+        at("arms.left.joints", [f"left_arm_{k}" for k in (6, 5, 4, 3, 2, 1)]),
+        "arms.left.joints must go from the shoulder outwards: left_arm_1, left_arm_2",
+    ),
+    "a joint twice": (
+        at("gaze.tilt", "neck_yaw"),
+        "gaze.tilt must be a joint of its own; gaze.pan has it, got 'neck_yaw'",
+    ),
+    "a tilt that looks up": (
+        at("gaze", {"waist": "waist", "pan": "neck_pitch", "tilt": "neck_yaw"}),
+        "gaze.tilt must be a joint that looks down where it grows, got 'neck_yaw'",
+    ),
+    "a gripper that opens too little": (
+        at("opening", 0.12),
+        "opening must be at most 0.09 m, which the left gripper opens, got 0.12",
+    ),
+    "a gripper that moves nothing": (
+        at("grippers.left.pads", ["left_hand", "left_wrist_3"]),
+        "grippers.left.joint must open and shut the pads",
+    ),
+    "one pad": (at("grippers.left.pads", ["left_hand"]), "grippers.left.pads must be 2 values"),
+    "a sensor that moves": (at("arms.left.sensor", "left_arm_6"), "arms.left.sensor must be a fixed joint between"),
+    "the other hand's sensor": (
+        at("arms.left.sensor", "right_wrist_sensor"),
+        "arms.left.sensor must be a fixed joint between left_arm_6 and left_grip, got 'right_wrist_sensor'",
+    ),
+    "no sensor": (at("arms.left.sensor", "torque"), "arms.left.sensor: torque is not supported yet"),
+    "lengths in millimeters": (at("base.footprint", [275, 275]), "base.footprint[0] must be within [0.05, 2], got 275"),
+    "a drive that there is none of": (at("base.drive", "tracks"), "base.drive must be differential or holonomic"),
+    "a fixed base that moves": (at("base.drive", "fixed"), "base.drive must be one that moves: base_x, base_y"),
+    "an angle for a length": (at("opening", 1.5), "opening must be within [0.01, 0.5], got 1.5"),
+    "a weld of nothing": (at("weld", ["elbow"]), "weld[0] must be a joint of the model, got 'elbow'"),
+    "text for a number": (at("opening", "wide"), "opening must be a finite number, got 'wide'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_file_is_refused_in_one_line_that_names_the_key(tmp_path, case):
+    change, words = WRONG[case]
+    path = variant(tmp_path, change=change)
+    with pytest.raises(ConfigError) as error:
+        Robot.load(path)
+    line = str(error.value)
+    assert words in line and line.startswith(str(path)) and "\n" not in line and len(line) < 600
+
+
+# What a robot may be and the program cannot use, or a scenario has no use for.
+USELESS = {
+    "home that touches": (
+        [at("arms.left.home", [0, -1.2, 0, 0, 0, 0]), at("arms.right.home", [0, 1.2, 0, 0, 0, 0])],
+        [],
+        "arms.left.home and arms.right.home must be free of all: robot::",
+    ),
+    "no waist": ([lambda given: given["gaze"].pop("waist")], [], "gaze.waist must be given"),
+    "hands too small for the valve": ([at("opening", 0.03)], [], "opening must be at least 0.035: marker.handle_width"),
+    "a selector that shuts the hands": ([], ["command_selector.gripper_high=0.08"], "opening must be at most command_"),
+}
+
+
+@pytest.mark.parametrize("case", USELESS)
+def test_a_robot_that_the_program_cannot_use_is_refused_in_one_line(tmp_path, case):
+    changes, overrides, words = USELESS[case]
+    path = variant(tmp_path, change=lambda given: [change(given) for change in changes])
+    with pytest.raises(ConfigError) as error:
+        make_blocks(load(None, [f"robot={path}", *overrides]))
+    assert words in str(error.value) and str(error.value).startswith(str(path)) and "\n" not in str(error.value)
+
+
+def test_seven_joints_are_a_robot_but_not_yet_one_that_runs(tmp_path):
+    path = variant(tmp_path, seven_joints, with_roll)
+    with pytest.raises(ConfigError, match=r"arms.left.joints must be 6 joints \(no other arm is supported yet\)"):
+        make_blocks(load(None, [f"robot={path}"]))
+
+
+def test_a_run_with_a_wrong_robot_ends_at_once_and_leaves_nothing(tmp_path, capsys):
+    path = variant(tmp_path / "robot", change=at("gaze.pan", "neck"))
+    log = tmp_path / "log.mcap"
+    assert cli.main(["run", "--set", f"robot={path}", "--log", str(log), "--no-html"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert re.search(r"robot.yaml: gaze.pan must be a joint of the model, got 'neck'", said.replace("\n", " "))
+    assert not log.exists()
+
+
+def test_no_key_of_our_file_is_left_at_a_default_by_mistake():
+    given = yaml_file.read(OURS)
+    assert {"model", "base", "gaze", "arms", "grippers", "opening", "cameras"} <= set(given)
+    assert len(OURS.read_text().splitlines()) < 80
