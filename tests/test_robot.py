@@ -229,7 +229,7 @@ WRONG = {
     "a key that is missing": (lambda given: given.pop("base"), "base.frame must be given, got ''"),
     "no model": (at("model", ""), "model must be given"),
     "a model that is not there": (at("model", "nobody.urdf"), "model: no such file: 'nobody.urdf'"),
-    "a package that is not there": (at("model", "package://pr9/a.urdf"), "model: no package 'pr9' in ROS_PACKAGE_PATH"),
+    "a package that is not there": (at("model", "package://pr9/a.urdf"), "model: no package 'pr9' beside the file, in ROS_PACKAGE_PATH"),
     "a file that is not in its package": (
         at("model", "package://valve_drake_models/a.urdf"),
         "model: no such file: 'package://valve_drake_models/a.urdf'",

@@ -17,7 +17,7 @@ from valve_drake import frames
 from valve_drake.analysis import experiments
 from valve_drake.analysis.drawn_images import Canvas
 from valve_drake.camera.lens import StereoHead
-from valve_drake.diagram import home
+from valve_drake.diagram import robot_of
 from valve_drake.messages import SIDES, MarkerEdges
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
@@ -51,7 +51,7 @@ class _Studio:
         mounts = true_head(self.eyes, ErrorConfig(head_yaw=0.0, head_rotation=0.0, head_mount=0.0), seed)
         size = (self.marker.size[0], self.marker.size[1])
         self.rig = CameraRig(mounts, self.valve, size, LightConfig(), camera, seed)
-        self._arms = dict(zip((name for side in SIDES for name in arm_joints(side)), home(Scenario())))
+        self._arms = dict(zip((name for side in SIDES for name in arm_joints(side)), robot_of(Scenario()).home))
         self.noise = float(self.camera.noise)  # type: ignore[arg-type]  # resolved: no distribution
 
     def place(self, rng: np.random.Generator, band: tuple[float, float]) -> _Place:

@@ -321,7 +321,8 @@ def make_simulated_station(
         builder.ExportOutput(truth.GetOutputPort(name), TRUTH + name)
 
     if meshcat is not None:
-        physics.view = _add_view(builder, positions.get_output_port(), valve, marker_size, meshcat, robot)  # lives as long
+        view = _add_view(builder, positions.get_output_port(), valve, marker_size, meshcat, robot)
+        physics.view = view  # lives as long
     station = builder.Build()
     station.set_name("simulated")
     check_contract(station)
