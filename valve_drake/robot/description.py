@@ -120,9 +120,12 @@ class Grippers(Config):
 
 @dc.dataclass
 class PadDescription(Config):
-    """Key `pad`: where the pads' surfaces are on their links. size: (0, 0) leaves the model's own contact shapes."""
+    """Key `pad`: where the pads' surfaces are on their links. size: (0, 0) leaves the model's own contact shapes.
 
-    at: list[float] = numbers([0.0, 0.0, 0.0], -0.3, 0.3, "middle of the surface, in the link [m]")
+    at: on the first link; on the second one its mirror image, beyond the plane y = 0 of the grip.
+    """
+
+    at: list[float] = numbers([0.0, 0.0, 0.0], -0.3, 0.3, "middle of the surface, in the first link [m]")
     size: list[float] = numbers([0.0, 0.0], 0.0, 0.1, "of the grid of contact points that is added [m]")
     friction: float = number(0.8, 0.05, 2.0, "of the added contact points")
 

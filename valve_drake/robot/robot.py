@@ -119,6 +119,7 @@ class Robot:
             q[_positions([joint[f"arms.{side}.joints[{k}]"] for k in range(len(self.arms[side]))])] = self.arms[
                 side
             ].home
+        self._follow(q)
         self._home_q = q
         self._chains = {side: self._chain(side, joint) for side in SIDES}
         self._check_sides()
@@ -319,14 +320,17 @@ class Robot:
         grip = self._chains[side].grip
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
         require(math.isfinite(low) and low < high < math.inf, f"{key}.joint", "a joint with limits", joint.name())
-        at = np.array(self.description.pad.at)
+        plant.SetPositions(self._context, self._home_q)
+        first = np.array(self.description.pad.at)
+        mirrored = plant.CalcPointsPositions(self._context, pads[0], first, grip)[:, 0] * [1, -1, 1]
+        surfaces = first, plant.CalcPointsPositions(self._context, grip, mirrored, pads[1])[:, 0]
         positions, distances = np.linspace(low, high, _OPENINGS), []
         q = self._home_q.copy()
         for position in positions:
             q[joint.position_start()] = position
             self._follow(q)
             plant.SetPositions(self._context, q)
-            points = [plant.CalcPointsPositions(self._context, pad, at, grip)[1, 0] for pad in pads]
+            points = [plant.CalcPointsPositions(self._context, *pad, grip)[1, 0] for pad in zip(pads, surfaces)]
             distances.append(points[0] - points[1])
         openings = np.array(distances)
         openings *= 1.0 if abs(openings.max()) >= abs(openings.min()) else -1.0
