@@ -28,8 +28,8 @@ def link(name, inside=MASS):
     return f'<link name="{name}">{inside}</link>'
 
 
-def joint(name, parent, child, inside=LIMIT, kind="revolute", axis="0 0 1", xyz="0 0 0"):
-    where = f'<origin xyz="{xyz}"/><parent link="{parent}"/><child link="{child}"/>'
+def joint(name, parent, child, inside=LIMIT, kind="revolute", axis="0 0 1", xyz="0 0 0", rpy="0 0 0"):
+    where = f'<origin xyz="{xyz}" rpy="{rpy}"/><parent link="{parent}"/><child link="{child}"/>'
     return f'<joint name="{name}" type="{kind}">{where}<axis xyz="{axis}"/>{inside}</joint>'
 
 
@@ -806,12 +806,22 @@ def two_arms(count=5, left="left", right="right", gripper="{0}_gripper"):
     parts += [joint("head_tilt_joint", "pan", "head", limit, axis="0 1 0")]
     for side in (left, right):
         eye = f"{side}_eye_optical_frame"
-        parts += [link(eye, ""), joint(f"{side}_eye_joint", "head", eye, "", "fixed")]
+        parts += [link(eye, ""), joint(f"{side}_eye_joint", "head", eye, "", "fixed", rpy="-1.5708 0 -1.5708")]
         parent = "torso"
         for k in range(count):
             name = f"{side}_arm_{k + 1}"
             axis = ("0 0 1", "0 1 0", "1 0 0")[k % 3]
-            parts += [link(name), joint(f"{name}_joint", parent, name, limit, axis=axis, xyz="0.2 0 0")]
+            parts += [
+                link(name),
+                joint(
+                    f"{name}_joint",
+                    parent,
+                    name,
+                    limit,
+                    axis=axis,
+                    xyz=f"0.2 {0.2 * (1 if side == left else -1) * (k == 0)} 0",
+                ),
+            ]
             parent = name
         palm = gripper.format(side)
         parts += [
@@ -846,12 +856,26 @@ def test_the_draft_knows_arms_grippers_head_and_lift(tmp_path):
         assert grip["link"] == f"{side}_gripper" and np.allclose(grip["xyz"], [0.1, 0, 0])
         R = urdf.rotation(np.array(grip["rpy"]))
         assert np.allclose(R[:, 2], [1, 0, 0], atol=1e-3) and np.allclose(np.abs(R[:, 1]), [0, 1, 0], atol=1e-3)
-    assert math.isclose(tree["opening"], 0.09, abs_tol=1.1e-3)
+    assert math.isclose(tree["opening"], 0.092, abs_tol=1.1e-3)
+    assert np.allclose(tree["pad"]["at"], [0.02, -0.005, 0]) and np.allclose(tree["pad"]["size"], [0.02, 0.01])
     assert tree["lift"] == {"joints": ["lift_joint"], "home": [0.2], "speed": [0.05]}
     assert tree["gaze"]["pan"] == "head_pan_joint" and tree["gaze"]["tilt"] == "head_tilt_joint"
     assert tree["cameras"]["head_left"] == "left_eye_optical_frame"
     assert tree["base"]["frame"] == "base_link" and tree["base"]["drive"] == "fixed"
     assert len(tree["arm_speed"]) == 5 and "weld" not in tree
+
+
+def test_the_draft_of_a_whole_robot_is_a_robot(tmp_path):
+    from valve_drake.robot.robot import Robot
+
+    wheels = [
+        part for k in "ab" for part in (link(f"wheel_{k}"), joint(f"w{k}", "base_link", f"wheel_{k}", kind="fixed"))
+    ]
+    code, folder = imported(tmp_path, *two_arms(7), *wheels)
+    assert yaml_file.read(folder / "robot.yaml")["base"]["drive"] == "differential"
+    found = Robot.load(folder / "robot.yaml")
+    assert code == 0 and len(found.arms["left"].names) == 7
+    assert math.isclose(found.description.opening, 0.092, abs_tol=1.1e-3)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from valve_drake.robot.urdf import Joint, Robot
 
 LEAST_ARM = 4  # joints of a chain that is taken for an arm
 SNAP = math.radians(15)  # a grip's axis this near to an axis of its link is that axis
+PAD_LENGTH = 0.02  # of a pad's surface; half of it on either side of its middle [m]
 STIFFNESS_PER_EFFORT = 130.0  # a joint's stiffness [N m/rad] for each N m of its limit: full effort at 8 mrad
 Ask = Callable[[str], str]  # notes what is to be done -> the comment that says it
 Boxes = Mapping[str, np.ndarray]  # link -> (2, 3) least and greatest corner of its shapes in its own frame [m]
@@ -57,6 +58,8 @@ class Hand:
     opening: float = 0.0
     grip: tuple[str, np.ndarray, np.ndarray] | None = None  # link, xyz, rpy
     camera: str | None = None
+    pad_at: np.ndarray | None = None  # in the first pad's link
+    pad_size: np.ndarray | None = None
 
 
 @dc.dataclass
@@ -232,30 +235,51 @@ def _hand(robot: Robot, arm: list[str], boxes: Boxes) -> Hand:
 
 
 def _grip(robot: Robot, hand: Hand, palm: str, boxes: Boxes) -> None:
-    """The opening, and the grip between the pads: z the approach, y the closing direction."""
+    """The grip between the pads (z the approach, y the closing direction), their surface, and the opening."""
     assert hand.driver is not None
     a, b = hand.pads
     found = []
     for q in robot.joints[hand.driver].range:
         if not math.isfinite(q):
             return
-        moving = [hand.driver, *(name for name in hand.more_drivers if robot.joints[name].parent != palm)]
-        poses = robot.poses(dict.fromkeys([moving[0]], q))
-        centres = [poses[link] @ np.append(boxes[link].mean(axis=0), 1.0) for link in (a, b)]
+        poses = robot.poses({hand.driver: q})
         X = np.linalg.inv(poses[palm])
-        found.append([(X @ centre)[:3] for centre in centres])
-    gaps = [float(np.linalg.norm(p - r)) for p, r in found]
-    hand.opening = math.floor(abs(gaps[1] - gaps[0]) * 1e3) / 1e3
-    shut, open_ = (found[0], found[1]) if gaps[0] < gaps[1] else (found[1], found[0])
-    middle, y = (shut[0] + shut[1]) / 2, _snapped(open_[0] - open_[1])
-    z = middle - (middle @ y) * y
-    if np.linalg.norm(z) < 1e-3:
+        found.append((X @ poses[a], X @ poses[b]))
+    middles = [[(X @ np.append(boxes[pad].mean(axis=0), 1.0))[:3] for X, pad in zip(pair, (a, b))] for pair in found]
+    gaps = [float(np.linalg.norm(p - r)) for p, r in middles]
+    shut, open_ = (0, 1) if gaps[0] < gaps[1] else (1, 0)
+    middle = (middles[shut][0] + middles[shut][1]) / 2
+    y = middles[open_][0] - middles[open_][1]
+    z = middle - (middle @ y) / (y @ y) * y
+    if np.linalg.norm(y) < 1e-3 or np.linalg.norm(z) < 1e-3:
         return
-    z = _snapped(z)
+    y, z = _snapped(y), _snapped(z)
     z = z - (z @ y) * y
     z /= np.linalg.norm(z)
+    hand.pad_at, hand.pad_size = _surface(boxes[a], found[shut][0][:3, :3].T @ np.stack([y, z], axis=1))
+    surface = [(pair[0] @ np.append(hand.pad_at, 1.0))[:3] for pair in found]
+    xyz = middle + ((surface[shut] - middle) @ z) * z
+    hand.opening = math.floor(2e3 * float((surface[open_] - xyz) @ y)) / 1e3
     R = np.stack([np.cross(y, z), y, z], axis=1)
-    hand.grip = palm, np.round(middle, 3) + 0.0, np.round(_rpy(R), 4) + 0.0
+    hand.grip = palm, np.round(xyz, 3) + 0.0, np.round(_rpy(R), 4) + 0.0
+
+
+def _surface(box: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and size of the gripping surface of a pad: the side of its box that closes, near its end.
+
+    axes: (3, 2) the closing direction, from the other pad to this, and the approach, in the pad's link.
+    """
+    at = box.mean(axis=0)
+    close = int(np.argmax(np.abs(axes[:, 0])))
+    reach = max((k for k in range(3) if k != close), key=lambda k: abs(axes[k, 1]))
+    width = 3 - close - reach
+    at[close] = box[0 if axes[close, 0] > 0 else 1, close]
+    length = float(np.ptp(box[:, reach]))
+    if length > 2 * PAD_LENGTH:  # a long finger holds with its end
+        end = box[1, reach] if axes[reach, 1] > 0 else box[0, reach]
+        at[reach] = end - np.sign(axes[reach, 1]) * PAD_LENGTH
+    size = np.array([min(PAD_LENGTH, length / 2), min(0.8 * PAD_LENGTH, float(np.ptp(box[:, width])) / 2)])
+    return np.round(at, 4) + 0.0, np.round(size, 4)
 
 
 def _snapped(direction: np.ndarray) -> np.ndarray:
@@ -415,9 +439,14 @@ def _gripper_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
             lines[-2] += "  " + ask(f"grippers.{side}: {rest} do not follow it: give them a <mimic>, or weld them")
     opening = min((hand.opening for hand in found.hands.values()), default=0.0)
     lines += [
-        f"opening: {opening:g}  " + ask("opening: between the open pads [m]; this is how far they move"),
-        "# " + ask("pad: {at, size, friction}: the middle of the gripping surface in the first pad's link [m]")[2:],
+        f"opening: {opening:g}  " + ask("opening: between the open pads' surfaces [m], from the shapes' boxes"),
     ]
+    shaped = next((hand for hand in found.hands.values() if hand.pad_at is not None), None)
+    say = ask("pad: the middle of the gripping surface in the first pad's link [m], its size [m], from its box")
+    if shaped is not None and shaped.pad_at is not None and shaped.pad_size is not None:
+        lines.append(f"pad: {{at: {_flow(shaped.pad_at)}, size: {_flow(shaped.pad_size)}, friction: 0.8}}  {say}")
+    else:
+        lines.append("# " + say[2:])
     return lines
 
 
