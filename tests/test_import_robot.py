@@ -865,6 +865,16 @@ def test_the_draft_knows_arms_grippers_head_and_lift(tmp_path):
     assert len(tree["arm_speed"]) == 5 and "weld" not in tree
 
 
+def test_a_camera_that_looks_along_x_gets_a_frame_that_looks_along_z(tmp_path):
+    straight = [part.replace('rpy="-1.5708 0 -1.5708"', 'rpy="0 0 0"') for part in two_arms()]
+    code, folder = imported(tmp_path, *(part.replace("eye_optical_frame", "eye_link") for part in straight))
+    tree = yaml_file.read(folder / "robot.yaml")
+    assert code == 0 and tree["cameras"]["head_left"] == "head_left_camera"
+    frame = tree["frames"]["head_left_camera"]
+    R = urdf.rotation(np.array(frame["rpy"]))
+    assert frame["link"] == "left_eye_link" and np.allclose(R, [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-4)
+
+
 def test_the_draft_of_a_whole_robot_is_a_robot(tmp_path):
     from valve_drake.robot.robot import Robot
 

@@ -12,11 +12,12 @@ from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
-from valve_drake.robot.urdf import Joint, Robot
+from valve_drake.robot.urdf import Joint, Robot, rotation
 
 LEAST_ARM = 4  # joints of a chain that is taken for an arm
 SNAP = math.radians(15)  # a grip's axis this near to an axis of its link is that axis
 PAD_LENGTH = 0.02  # of a pad's surface; half of it on either side of its middle [m]
+_OPTICAL = (-math.pi / 2, 0.0, -math.pi / 2)  # roll, pitch, yaw from x forward, z up to z forward, x to the right
 STIFFNESS_PER_EFFORT = 130.0  # a joint's stiffness [N m/rad] for each N m of its limit: full effort at 8 mrad
 Ask = Callable[[str], str]  # notes what is to be done -> the comment that says it
 Boxes = Mapping[str, np.ndarray]  # link -> (2, 3) least and greatest corner of its shapes in its own frame [m]
@@ -75,7 +76,8 @@ class Guess:
     waist: str | None
     pan: str | None
     tilt: str | None
-    eye: str | None
+    cameras: dict[str, str]
+    turned: list[str]
     second_eye: str | None
     weld: list[str]
     colors: list[str]
@@ -90,6 +92,7 @@ def guess(robot: Robot, boxes: Boxes, colors: Mapping[str, tuple[float, ...]], w
     waists = [j.name for j in common if j.type != "prismatic" and abs(_axis(j, poses)[2]) > 0.9]
     pan, tilt, eye, second = _head(robot, arms, common, poses)
     hands = {side: _hand(robot, joints, boxes) for side, joints in arms.items()}
+    cameras, turned = _cameras(robot, eye, hands, poses)
     named = {*lift, *waists[:1], *(j for arm in arms.values() for j in arm), pan, tilt}
     named |= {hand.driver for hand in hands.values()}
     weld = [j.name for j in robot.joints.values() if j.moving and j.mimic is None and j.name not in named]
@@ -108,7 +111,8 @@ def guess(robot: Robot, boxes: Boxes, colors: Mapping[str, tuple[float, ...]], w
         waist=waists[0] if waists else None,
         pan=pan,
         tilt=tilt,
-        eye=eye,
+        cameras=cameras,
+        turned=turned,
         second_eye=second,
         weld=weld,
         colors=[name for name, rgba in colors.items() if _as_the_marks(rgba)],
@@ -341,7 +345,7 @@ def draft(robot: Robot, found: Guess, model: str, mends: Iterable[str]) -> tuple
     )
     lines += [
         "base:",
-        f"  frame: {found.base}",
+        f"  frame: {_key(found.base)}",
         f"  drive: {found.drive}  " + ask("base.drive: holonomic, differential or fixed: from the wheels' names"),
         f"  footprint: [{found.footprint[0]:g}, {found.footprint[1]:g}]  # half length, half width of the shapes [m]",
     ]
@@ -378,9 +382,9 @@ def _gaze(robot: Robot, found: Guess, ask: Ask) -> list[str]:
         else:
             backwards = _axis(robot.joints[name], poses)[axis] < 0
             note = "  " + ask(f"gaze.{key}: {name} turns the other way than {way}") if backwards else f"  # turns {way}"
-            lines.append(f"  {key}: {name}{note}")
+            lines.append(f"  {key}: {_key(name)}{note}")
     if found.waist:
-        lines.append(f"  waist: {found.waist}")
+        lines.append(f"  waist: {_key(found.waist)}")
     speeds = [robot.joints[name].limit("velocity") or 1.0 for name in (found.pan, found.tilt) if name]
     lines.append(f"  speed: {min(1.5, *speeds, 1.5):g}")
     return lines
@@ -413,7 +417,9 @@ def _arm_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
             say_ = ask("arms.*.sensor: no fixed joint beyond the arm: forces come from the joints' torques")
             lines.append(f"    sensor: torque  {say_}")
         else:
-            lines.append(f"    sensor: {sensor}  " + say("arms.*.sensor: the fixed joint in which forces are measured"))
+            lines.append(
+                f"    sensor: {_key(sensor)}  " + say("arms.*.sensor: the fixed joint in which forces are measured")
+            )
     fast = []
     for k in range(len(found.arms["left"])):
         limits = [robot.joints[arm[k]].limit("velocity") or 1.0 for arm in found.arms.values()]
@@ -431,7 +437,7 @@ def _gripper_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
             lines.append(f"  # {side}: " + ask(f"grippers.{side}: no moving joint beyond the arm")[2:])
             continue
         pads = _flow(hand.pads) if hand.pads else "[]  " + ask(f"grippers.{side}.pads: two links that close on the bar")
-        lines += [f"  {side}:", f"    joint: {hand.driver}", f"    pads: {pads}"]
+        lines += [f"  {side}:", f"    joint: {_key(hand.driver)}", f"    pads: {pads}"]
         if not robot.joints[hand.driver].limit("effort"):
             lines[-2] += "  " + ask(f"grippers.{side}: {hand.driver} has no effort limit in the model, so no actuator")
         elif hand.more_drivers:
@@ -451,40 +457,55 @@ def _gripper_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
 
 
 def _frame_lines(found: Guess, ask: Ask) -> list[str]:
-    frames, cameras = [], []
-    if found.eye:
-        cameras.append(f"head_left: {found.eye}")
-    for side, hand in found.hands.items():
-        if hand.grip:
-            link, xyz, rpy = hand.grip
-            frames.append(f"  {side}_grip: {{link: {link}, xyz: {_flow(xyz)}, rpy: {_flow(rpy)}}}")
-        if hand.camera:
-            cameras.append(f"{side}_wrist: {hand.camera}")
+    frames, grips = [], [(side, hand.grip) for side, hand in found.hands.items() if hand.grip]
+    for side, (link, xyz, rpy) in grips:
+        frames.append(f"  {side}_grip: {{link: {_key(link)}, xyz: {_flow(xyz)}, rpy: {_flow(rpy)}}}")
+    for key in found.turned:
+        link = found.cameras[key]
+        note = ask(f"frames.{key}_camera: {link} looks along its x, as ROS has it: z must look, x to the right")
+        frames.append(f"  {key}_camera: {{link: {_key(link)}, rpy: {_flow(_OPTICAL)}}}  {note}")
     lines = []
+    if found.arms and not grips:
+        lines.append("# " + ask("frames: left_grip, right_grip {link, xyz, rpy}: no two pads were found")[2:])
     if frames:
-        lines.append("frames:  " + ask("frames: the grips between the pads: z the approach, y the closing direction"))
-        lines += frames
-    elif found.arms:
-        lines.append("# frames: " + ask("frames: left_grip, right_grip {link, xyz, rpy}: no two pads were found")[2:])
-    if cameras:
-        lines.append(f"cameras: {{{', '.join(cameras)}}}")
-    for camera in cameras:
-        key, name = camera.split(": ")
-        if "optical" not in name.lower():
-            lines.append(
-                "# " + ask(f"cameras.{key}: {name} must look along z, x to the right; else give a frame that does")[2:]
-            )
-    if found.eye is None:
-        lines.append(
-            "# " + ask("cameras.head_left: no camera's frame was found on the head: z forward, x to the right")[2:]
-        )
+        lines += ["frames:", *frames]
+    if grips:
+        lines.insert(-len(frames), ask("frames: the grips between the pads: z the approach, y the closing direction"))
+    if found.cameras:
+        names = {key: f"{key}_camera" if key in found.turned else link for key, link in found.cameras.items()}
+        lines.append(f"cameras: {{{', '.join(f'{key}: {_key(name)}' for key, name in names.items())}}}")
+    if "head_left" not in found.cameras:
+        lines.append(ask("cameras.head_left: no camera's frame was found on the head: z forward, x to the right"))
     elif found.second_eye is None:
-        lines.append("# " + ask("cameras: no second eye in the model: the valve is found with two")[2:])
-    if found.arms and not all(hand.camera for hand in found.hands.values()):
-        lines.append(
-            "# " + ask("cameras.*_wrist: no camera beyond the arms' last joints: mount them, or servo: none")[2:]
-        )
+        lines.append(ask("cameras: no second eye in the model: the valve is found with two"))
+    if any(f"{side}_wrist" not in found.cameras for side in found.arms):
+        lines.append(ask("cameras.*_wrist: no camera beyond the arms' last joints: mount them, or servo: none"))
     return lines
+
+
+def _cameras(
+    robot: Robot, eye: str | None, hands: Mapping[str, Hand], poses: Mapping[str, np.ndarray]
+) -> tuple[dict[str, str], list[str]]:
+    """The cameras' links by their keys, and the keys of those that look along x and not along z."""
+    cameras, turned = {}, []
+    if eye is not None:
+        cameras["head_left"] = eye
+        if _along_x(poses[eye], np.array([1.0, 0, 0])):
+            turned.append("head_left")
+    for side, hand in hands.items():
+        if hand.camera is None:
+            continue
+        cameras[f"{side}_wrist"] = hand.camera
+        if hand.grip is not None:
+            palm, _, rpy = hand.grip
+            if _along_x(poses[hand.camera], poses[palm][:3, :3] @ rotation(rpy)[:, 2]):
+                turned.append(f"{side}_wrist")
+    return cameras, [key for key in turned if f"{key}_camera" not in robot.links]
+
+
+def _along_x(X: np.ndarray, forward: np.ndarray) -> bool:
+    """Whether a frame's x rather than its z looks along a direction of the root."""
+    return bool(X[:3, 0] @ forward > max(X[:3, 2] @ forward, 0.5))
 
 
 def _home(joint: Joint) -> float:
