@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from robot_facts import ARMS_HOME as HOME
 from robot_facts import ROBOT
+from robot_variants import variant
 
 from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances, hand_in_valve, standoff, turned
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import SIDES
 from valve_drake.perception.marker import Marker
+from valve_drake.robot.robot import Robot
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
 
@@ -121,3 +123,22 @@ def test_every_question_is_answered_afresh(model, X_BV):
     q = arms(X_BV, aside=ON_BAR)
     answers = [model.is_free(X, p) for X, p in ((X_BV, q), (None, q), (X_BV, HOME), (X_BV, q), (None, HOME))]
     assert answers == [False, True, True, False, True]
+
+
+def test_what_touches_at_home_may_touch_if_the_robot_says_so(tmp_path):
+    crossed = {"left": [0, -1.2, 0, 0, 0, 0], "right": [0, 1.2, 0, 0, 0, 0]}
+
+    def make_home(given, ignore):
+        for side, home in crossed.items():
+            given["arms"][side]["home"] = home
+        given["collision"] = {"ignore": ignore}
+
+    free = {}
+    for ignore in ("", "touching_at_home"):
+        robot = Robot.load(variant(tmp_path / ignore, change=lambda given, ignore=ignore: make_home(given, ignore)))
+        model = CollisionModel(robot, MARKER)
+        free[ignore] = model.is_free(None, robot.home)
+        inwards = np.zeros(12)
+        inwards[[1, 7]] = -0.3, 0.3
+        assert not model.is_free(None, inwards)  # other parts of the arms
+    assert free == {"": False, "touching_at_home": True}

@@ -324,6 +324,7 @@ USELESS = {
         [],
         "arms.left.home and arms.right.home must be free of all: robot::",
     ),
+    "no servo": ([at("servo", "none")], [], "servo must be camera"),
     "no waist": ([lambda given: given["gaze"].pop("waist")], [], "gaze.waist must be given"),
     "hands too small for the valve": ([at("opening", 0.03)], [], "opening must be at least 0.035: marker.handle_width"),
     "a selector that shuts the hands": ([], ["command_selector.gripper_high=0.08"], "opening must be at most command_"),

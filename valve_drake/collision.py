@@ -1,7 +1,7 @@
 """Do the arms touch anything? A model of robot, valve and panel for planning, apart from the simulated plant."""
 
 import numpy as np
-from pydrake.geometry import QueryObject
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, QueryObject, SignedDistancePair
 from pydrake.math import RigidTransform, RotationMatrix
 
 from valve_drake.frames import compose, make
@@ -28,6 +28,15 @@ class CollisionModel:
         self._panel_depth = marker.panel_depth
         self._arms = robot.slots([name for side in SIDES for name in robot.arms[side].names])
         self._rest = robot.rest(robot.opening if opening is None else opening)
+        if robot.description.collision.ignore:
+            self._ignore(self._near(None, robot.home))
+
+    def _ignore(self, pairs: list[SignedDistancePair]) -> None:
+        """These pairs of shapes may touch from now on."""
+        filters = self._scene_graph.collision_filter_manager(self._scene_graph.GetMyMutableContextFromRoot(self._root))
+        for pair in pairs:
+            both = GeometrySet(pair.id_A), GeometrySet(pair.id_B)
+            filters.Apply(CollisionFilterDeclaration().ExcludeBetween(*both))
 
     def _pose(self, X_BV: np.ndarray | None, q: np.ndarray) -> QueryObject:
         """Poses the model and returns the geometry query for it."""
@@ -44,11 +53,17 @@ class CollisionModel:
 
     def is_free(self, X_BV: np.ndarray | None, q: np.ndarray) -> bool:
         """True if no two bodies are nearer than the clearance. X_BV: marker in the base (None: no valve); q: arms."""
-        return len(self._pose(X_BV, q).ComputeSignedDistancePairwiseClosestPoints(self._clearance)) == 0
+        return len(self._near(X_BV, q)) == 0
 
     def touching(self, X_BV: np.ndarray | None, q: np.ndarray) -> list[str]:
         """Names of the pairs that are nearer than the clearance, for messages."""
-        query = self._pose(X_BV, q)
-        name = query.inspector().GetName
-        pairs = query.ComputeSignedDistancePairwiseClosestPoints(self._clearance)
+        name = self._scene_graph.model_inspector().GetName
+        pairs = self._near(X_BV, q)
         return [f"{name(p.id_A)} - {name(p.id_B)}: {1e3 * p.distance:.0f} mm" for p in pairs]
+
+    def _near(self, X_BV: np.ndarray | None, q: np.ndarray) -> list[SignedDistancePair]:
+        """All pairs of shapes that are nearer than the clearance."""
+        pairs: list[SignedDistancePair] = self._pose(X_BV, q).ComputeSignedDistancePairwiseClosestPoints(
+            self._clearance
+        )
+        return pairs

@@ -115,6 +115,7 @@ def robot_of(scenario: Scenario) -> Robot:
             require(len(arm) == count, f"arms.{side}.joints", f"{count} joints (no other arm is supported yet)", arm)
         require(not d.lift.joints, "lift.joints", "none (a lift is not supported yet)", d.lift.joints)
         require(bool(d.gaze.waist), "gaze.waist", "given (a robot without one is not supported yet)", d.gaze.waist)
+        require(d.servo == "camera", "servo", "camera (another way is not supported yet)", d.servo)
         require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
         high, width = scenario.command_selector.gripper_high, scenario.marker.handle_width
         require(d.opening <= high, "opening", f"at most command_selector.gripper_high, {high:g}", d.opening)

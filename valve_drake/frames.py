@@ -5,13 +5,12 @@ R_AB rotation, V_AB = [w; v], F = [torque; force].
 
     W  world (simulation only; controllers never use it)
     O  odometry: where the base stood at the start; what controllers use as a world. It drifts against W.
-    B  base: on the floor under the waist axis, x forward, y left, z up
-    H  chest (reference of Table 5): turns with the waist, axes as B at zero, at the shoulders' mid-point
+    B  base: on the floor, x forward, y left, z up; the frame that robot.yaml names
     L, R  head cameras: x right, y down, z forward; pixel (0, 0) is the centre of the first pixel (OpenCV)
     A, D  left and right wrist cameras (not calibrated: no code may use their lens or mounting)
     V  marker: origin at the rectangle's centre, x along the handles, z into the panel
     G, K  left and right hand, at the grip point: z approach, y closing direction, x = y cross z (along the bar)
-    S, T  left and right wrist sensor: axes as the hand's, behind the grip point by GRIP_BEHIND
+    S, T  left and right wrist sensor: the child's frame of the fixed joint that robot.yaml names
 
 Valve angle: positive opens = counter-clockwise seen from the robot = about -z of V.
 """

@@ -97,12 +97,18 @@ class Stances:
     is_free: Callable[[np.ndarray | None, np.ndarray], bool]
 
     def check_arc(
-        self, X_BV: np.ndarray, turn_angle: float, swapped: bool, near: Mapping[str, np.ndarray] | None = None
+        self,
+        X_BV: np.ndarray,
+        turn_angle: float,
+        swapped: bool,
+        near: Mapping[str, np.ndarray] | None = None,
+        least: float = 0.0,
     ) -> ArcCheck:
         """Whether both hands can hold their handles all along the turn, and draw back from them at both ends.
 
         X_BV: marker in the base, lift and waist at home. near: joints of a like arc's start, by side.
-        The arms are free of all at the turn's start, middle and end, or the margin is -1.
+        least: the check ends where the margin falls to it: whoever asks knows a better arc.
+        Unless the arms are free of all at the turn's start, middle and end, the margin is -1.
         """
         robot, out = self.robot, ArcCheck(-1.0, swapped)
         count = max(2, int(np.ceil(abs(turn_angle) / self.config.arc_step)) + 1)
@@ -125,7 +131,7 @@ class Stances:
                     if back is None:
                         return out
                     margin = min(margin, robot.margin(side, back))
-                if margin <= 0:
+                if margin <= least:
                     return ArcCheck(margin, swapped)
                 arcs[side].append(q)
                 q_last = q
@@ -135,9 +141,11 @@ class Stances:
                 return out
         return ArcCheck(margin, swapped, {side: arcs[side][0] for side in SIDES})
 
-    def best_arc(self, X_BV: np.ndarray, turn_angle: float, near: ArcCheck | None = None) -> ArcCheck:
+    def best_arc(
+        self, X_BV: np.ndarray, turn_angle: float, near: ArcCheck | None = None, least: float = 0.0
+    ) -> ArcCheck:
         """The assignment of the handles to the hands with which the arms do not cross; where that does not serve, the
-        better of the two by its margin. near: a like arc, to start from."""
+        better of the two by its margin. near: a like arc, to start from; least: as of `check_arc`."""
         middle = turned(X_BV, turn_angle / 2)
         left = {
             swapped: compose(middle, hand_in_valve(LEFT, swapped, self.marker))[1, 3]
@@ -148,7 +156,7 @@ class Stances:
         best = ArcCheck(-1.0, orders[0])
         for swapped in orders:
             start = near.q if near is not None and near.swapped == swapped else None
-            arc = self.check_arc(X_BV, turn_angle, swapped, start)
+            arc = self.check_arc(X_BV, turn_angle, swapped, start, max(best.margin, least))
             if arc.margin > best.margin:
                 best = arc
             if best.margin >= self.config.margin_min:
@@ -170,7 +178,8 @@ class Stances:
         for distance in np.arange(c.distance_min, c.distance_max + 1e-9, c.distance_step):
             xy = axis_point[:2] - distance * forward
             base = np.array([xy[0], xy[1], heading])
-            arc = self.best_arc(compose(inverse(planar(*base)), X_OV), turn_angle, arc)
+            X_BV = compose(inverse(planar(*base)), X_OV)
+            arc = self.best_arc(X_BV, turn_angle, arc, max(margin, 0.0))
             if arc.margin > margin:
                 best, margin = base, arc.margin
             if margin >= c.margin_enough:

@@ -2,6 +2,11 @@
 
 A description names joints and frames of the model; whether the model has them is checked where it is read
 (robot/model.py, robot/robot.py). SI units and radians. A list of joints goes from the body outwards.
+
+So far a run takes robots whose groups have as many joints as our own (diagram.robot_of refuses the others), and these
+keys are checked and not yet used: base.footprint, base.speed and base.acceleration (base_approach and
+command_selector have their own), lift.speed, gaze.speed, arm_speed, stiffness, pad.size and pad.friction,
+head_calibration and taught (the scenario's keys of these names count), colors.
 """
 
 import dataclasses as dc
@@ -144,7 +149,7 @@ class FrameDescription(Config):
 
 @dc.dataclass
 class CollisionDescription(Config):
-    """Key `collision`. ignore: which pairs of links may touch beside those that the model file filters."""
+    """Key `collision`. ignore: which pairs of shapes may touch beside those that the model file filters."""
 
     ignore: str = choice("", ("", "touching_at_home"), "pairs that are ignored")
     padding: float = number(0.015, 0.0, 0.1, "least distance that counts as free [m]")
@@ -166,11 +171,12 @@ class RobotDescription(Config):
     opening: float = number(0.085, 0.01, 0.5, "of an open gripper, between the pads [m]")
     pad: PadDescription = dc.field(default_factory=PadDescription)
     frames: dict[str, FrameDescription] = named("that are added to the model")
+    servo: str = choice("camera", ("camera", "none"), "how hands find the handles; none: by the head and touch alone")
     cameras: dict[str, str] = texts(
         {"head_left": "", "left_wrist": "", "right_wrist": ""}, "their frames: x right, y down, z forward"
     )
-    head_calibration: str = plain("", "of the stereo head; the scenario's key of this name is used for the present")
-    taught: str = plain("", "references of the hands; the scenario's key of this name is used for the present")
+    head_calibration: str = plain("", "of the stereo head: a path from this file")
+    taught: str = plain("", "references of the hands: a path from this file")
     colors: dict[str, list[float]] = named("materials of the model that are painted over", 0.0, 1.0, (4, 4))
     collision: CollisionDescription = dc.field(default_factory=CollisionDescription)
 
