@@ -288,6 +288,16 @@ def test_a_base_that_stands_wrong_asks_for_another_stance(base):
     assert bench.memory.stance.base == pytest.approx(base, abs=0.025)
 
 
+@pytest.mark.parametrize(("waist", "state"), [(0.004, "succeeded"), (0.006, "failed"), (-0.3, "failed")])
+def test_a_waist_that_does_not_stand_at_home_is_a_fault_and_no_grasp_beside_the_handles(base, waist, state):
+    bench = Bench(base)
+    bench.torso = np.array([waist, 0.3, 0.0])
+    status = bench.run(Mode.MEASURE)
+    assert status.state == state
+    if state == "failed":
+        assert status.verdict == "fault" and status.detail.startswith(f"waist stands at {waist:.3f}")
+
+
 # ---------------------------------------------------------------- reach
 
 

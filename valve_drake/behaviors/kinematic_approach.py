@@ -93,6 +93,7 @@ class Memory:
 
 # Modes in which another block moves the arms; on return the commands start from the measured joints.
 NOT_OWNED = tuple(mode for mode, row in TABLE.items() if row.hands != "kinematic_approach")
+OFF_HOME = 0.005  # of lift and waist while the hands work; it displaces them by as much a meter away [rad, m]
 NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms [m]
 
 
@@ -259,6 +260,12 @@ class KinematicApproach:
         fused = fuse(m.looks)
         if not fused.found:
             return self._status(changed(m, phase="end"), time, "failed", Verdict.MARKER_LOST, fused.reason)
+        posture = self.robot.posture
+        off = np.abs(state.torso[: len(posture)] - posture.home)
+        if len(posture) and not np.max(off) <= OFF_HOME:
+            k = int(np.argmax(off))
+            detail = f"{posture.names[k]} stands at {state.torso[k]:.3f}, the arms reach from {posture.home[k]:.3f}"
+            return self._status(changed(m, phase="end"), time, "failed", Verdict.FAULT, detail)
         X_BV = compose(inverse(planar(*state.odometry[:3])), fused.X_OV)
         arc = self.stances.best_arc(X_BV, mode.turn_angle)
         if arc.margin < self.stances.config.margin_min:

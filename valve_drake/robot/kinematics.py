@@ -79,6 +79,9 @@ class RobotKinematics(Protocol):
     def arms(self) -> Mapping[str, Arm]: ...
 
     @property
+    def posture(self) -> Joints: ...
+
+    @property
     def hands(self) -> Mapping[str, HandLoad]: ...
 
     @property
