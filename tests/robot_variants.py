@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from valve_drake import resources, yaml_file
+from valve_drake import yaml_file
 from valve_drake.messages import SIDES
 from valve_drake.robot import description
 
@@ -25,8 +25,6 @@ def variant(folder: Path, edit: Edit = lambda model: None, change: Change = lamb
         uri.text = (uri.text or "").replace("../meshes", "package://valve_drake_models/meshes")
     edit(model)
     given = yaml_file.read(source)
-    for name in ("head_calibration", "taught"):
-        given[name] = str(resources.models() / given[name].removeprefix("../"))
     change(given)
     folder.mkdir(parents=True, exist_ok=True)
     tree.write(folder / "robot.sdf", encoding="unicode")
