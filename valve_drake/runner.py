@@ -60,6 +60,7 @@ from valve_drake.versions import versions
 
 STEP = 1 / 32  # between two looks at the mode [s]
 TAIL = 1.5  # recorded after the end: a stopped base takes a second to stand [s]
+TAIL_DONE = 0.5  # the same of a run that is done: its base stands already [s]
 VIEW_PORT = 7000  # that Drake's 3D view tries first
 # Of the files that a scenario names: what reads one, and raises ConfigError.
 READERS: dict[str, Callable[[Path], object]] = {
@@ -334,7 +335,7 @@ def _advance(
         if link is not None:
             link.tell(mode.mode, mode.activation)
         if mode.mode in TERMINAL and duration is None:
-            end = min(end, mode.since + TAIL)
+            end = min(end, mode.since + (TAIL_DONE if mode.mode == Mode.DONE else TAIL))
         if now >= end:
             if link is not None:
                 link.leave()
