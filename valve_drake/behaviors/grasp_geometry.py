@@ -120,7 +120,8 @@ class Stances:
             q_last = near.get(side) if near else None
             for k, angle in enumerate(angles):
                 X_BG = compose(turned(X_BV, angle), X_VG)
-                q = robot.inverse(side, X_BG, q_last)
+                start = q_last if k < 2 else 2 * arcs[side][-1] - arcs[side][-2]  # goes on as before
+                q = robot.inverse(side, X_BG, start)
                 if q is None and k == 0 and q_last is not None:
                     q = robot.inverse(side, X_BG)
                 if q is None or (k > 0 and q_last is not None and np.max(np.abs(q - q_last)) > JUMP):

@@ -189,8 +189,7 @@ def search(
 
 def margin(q: np.ndarray, J: np.ndarray, arm: Arm) -> float:
     """See RobotKinematics.margin; J: its Jacobian there (6, n)."""
-    with np.errstate(invalid="ignore"):
-        room = np.minimum(q - arm.low, arm.high - q) / np.minimum(_ROOM, (arm.high - arm.low) / 4)
+    room = np.minimum(q - arm.low, arm.high - q) / np.minimum(_ROOM, (arm.high - arm.low) / 4)
     scaled = J.copy()
     scaled[3:] /= LENGTH
     least = math.sqrt(max(float(np.linalg.eigvalsh(scaled @ scaled.T)[0]), 0.0))
