@@ -21,7 +21,6 @@ from pydrake.systems.framework import (
     Context,
     Diagram,
     DiagramBuilder,
-    FixedInputPortValue,
     State,
 )
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
@@ -38,6 +37,9 @@ STEPS = 2  # of the plant in a tick; twice as many leave forces and angles as th
 FINGER_STIFFNESS = 2e4  # of the finger servo, as in the model file [N/m]
 COMMANDS = {spec.name: spec.kind for spec in CONTRACT if spec.direction == "in" and isinstance(spec.kind, int)}
 LOADED = {**{side: f"{side}_wrist_sensor" for side in SIDES}, "stem": "stem"}  # output port -> joint
+
+
+_Pose = tuple[float, float, float]  # x, y, heading [m, rad]
 
 
 class Stepped(NamedTuple):
@@ -126,7 +128,11 @@ class PlantSystem(PythonSystem):
         self._scratch = self.diagram.CreateDefaultContext()
         self._lock = threading.Lock()  # of the scratch: two threads may advance two Contexts
         self._inner = self.plant.GetMyMutableContextFromRoot(self._scratch)
-        self._desired = self._fix(self._scratch, np.zeros(2 * len(self.actuated)))
+        desired = np.zeros(2 * len(joints))  # [q_d; v_d] of the robot's actuators
+        self._fixed = self.diagram.GetInputPort("desired").FixValue(self._scratch, desired)
+        self._desired = self._fixed.GetMutableData().get_mutable_value().get_mutable_value()  # its memory
+        self._net_actuation = self.plant.get_net_actuation_output_port(self.robot)
+        self._reaction_forces = self.plant.get_reaction_forces_output_port()
         self._loads = [self.plant.GetJointByName(name).index() for name in LOADED.values()]
         self._x = self.DeclareDiscreteState(self.plant.GetPositionsAndVelocities(self._inner))
         self._base = self.DeclareDiscreteState([start[name] for name in BASE])
@@ -149,32 +155,37 @@ class PlantSystem(PythonSystem):
         inner.SetTime(context.get_time())
         plant_context = self.plant.GetMyMutableContextFromRoot(inner)
         self.plant.SetPositionsAndVelocities(plant_context, x)
-        self._fix(inner, self._set_points(x, base, self._commands(context), 0.0))
+        commands, desired = self._commands(context), np.zeros(len(self._desired))
+        self._set_joints(desired, commands)
+        self._set_base(desired, tuple(base.tolist()), tuple(commands["base.twist_command"].tolist()), 0.0)
+        self._set_fingers(desired, x, _grips(commands))
+        self.diagram.GetInputPort("desired").FixValue(inner, desired)
         return plant_context
-
-    def _fix(self, context: Context, desired: np.ndarray) -> FixedInputPortValue:
-        return self.diagram.GetInputPort("desired").FixValue(context, desired)
 
     def _commands(self, context: Context) -> dict[str, np.ndarray]:
         return {name: port.Eval(context) for name, port in self._inputs.items()}
 
-    def _set_points(self, x: np.ndarray, base: np.ndarray, commands: dict[str, np.ndarray], time: float) -> np.ndarray:
-        """[q_d; v_d] of the robot's actuators, `time` after the tick's begin; base: its set point then, x: now."""
-        n = len(self.actuated)
-        desired = np.zeros(2 * n)
+    def _set_joints(self, desired: np.ndarray, commands: dict[str, np.ndarray]) -> None:
+        """Arms and torso in [q_d; v_d] of the robot's actuators: the same throughout a tick."""
         sent = [commands["torso.position_command"], *(commands[f"{side}_arm.position_command"] for side in SIDES)]
         desired[self._sent] = np.concatenate(sent) - self._zeros
-        forward, yaw_rate = commands["base.twist_command"]
-        pose = _driven(base, forward, yaw_rate, time)
-        speed = (forward * math.cos(pose[2]), forward * math.sin(pose[2]), yaw_rate)
-        for k, at in enumerate(self._base_at):
-            desired[at], desired[n + at] = pose[k], speed[k]
-        for side, (at, position) in zip(SIDES, self._fingers):
-            q = x[position]
-            reach = commands[f"{side}_gripper.force_limit"][0] / FINGER_STIFFNESS
-            opening = commands[f"{side}_gripper.position_command"][0]
-            desired[at] = q + min(max(opening / 2 - q, -reach), reach)
-        return desired
+
+    def _set_base(self, desired: np.ndarray, base: _Pose, twist: tuple[float, float], time: float) -> None:
+        """The base in `desired`, `time` after the tick's begin; base: its set point then."""
+        forward, yaw_rate = twist
+        pose = _driven(base, twist, time)
+        heading = pose[2]
+        speed = (forward * math.cos(heading), forward * math.sin(heading), yaw_rate)
+        n = len(self.actuated)
+        for at, q, v in zip(self._base_at, pose, speed):
+            desired[at], desired[n + at] = q, v
+
+    def _set_fingers(self, desired: np.ndarray, x: np.ndarray, grips: list[tuple[float, float]]) -> None:
+        """The fingers in `desired`; x: now; grips: of each hand where its finger is sent and how far from where it is
+        the servo may pull it [m]."""
+        for (at, position), (goal, reach) in zip(self._fingers, grips):
+            q = float(x[position])
+            desired[at] = q + min(max(goal - q, -reach), reach)
 
     def _update(self, context: Context, state: State) -> None:
         x, base = (context.get_discrete_state(index).value() for index in (self._x, self._base))
@@ -190,28 +201,42 @@ class PlantSystem(PythonSystem):
 
     def _advance(self, x: np.ndarray, base: np.ndarray, commands: dict[str, np.ndarray]) -> Stepped:
         """One tick. It depends on the arguments alone."""
-        plant, scratch = self.plant, self._scratch
-        plant.SetPositionsAndVelocities(self._inner, x)
+        scratch, desired = self._scratch, self._desired
+        start: _Pose = tuple(base.tolist())
+        twist: tuple[float, float] = tuple(commands["base.twist_command"].tolist())
+        grips = _grips(commands)
+        scratch.SetDiscreteState(x)
         for k in range(STEPS):
-            desired = self._set_points(x, base, commands, k * TICK / STEPS)
-            self._desired.GetMutableData().get_mutable_value().SetFromVector(desired)
+            self._fixed.GetMutableData()  # tells the Context that `desired`, its memory, changes
+            if k == 0:
+                self._set_joints(desired, commands)
+            self._set_base(desired, start, twist, k * TICK / STEPS)
+            self._set_fingers(desired, x, grips)
             after = self.diagram.EvalUniquePeriodicDiscreteUpdate(scratch)
-            if k == STEPS - 1:  # read before the step is taken: what they need of it is in the cache
-                actuation = np.array(plant.get_net_actuation_output_port(self.robot).Eval(self._inner))
-                forces = plant.get_reaction_forces_output_port().Eval(self._inner)
-            scratch.SetDiscreteState(after)
-            x = plant.GetPositionsAndVelocities(self._inner)
-        loads = [np.concatenate([forces[k].rotational(), forces[k].translational()]) for k in self._loads]
-        forward, yaw_rate = commands["base.twist_command"]
-        return Stepped(x, _driven(base, forward, yaw_rate, TICK), actuation, loads)
+            x = after.value(0)
+            if k < STEPS - 1:
+                scratch.SetDiscreteState(x)
+        # The last step is not taken in the scratch, so what the outputs need of it is in the cache.
+        actuation = np.array(self._net_actuation.Eval(self._inner))
+        forces = self._reaction_forces.Eval(self._inner)
+        loads = [forces[k].get_coeffs() for k in self._loads]
+        return Stepped(np.array(x), np.array(_driven(start, twist, TICK)), actuation, loads)
 
 
-def _driven(base: np.ndarray, forward: float, yaw_rate: float, time: float) -> np.ndarray:
+def _grips(commands: dict[str, np.ndarray]) -> list[tuple[float, float]]:
+    """Of each hand: where its finger is sent, how far from where it is the servo may pull it [m]."""
+    openings = (float(commands[f"{side}_gripper.position_command"][0]) for side in SIDES)
+    forces = (float(commands[f"{side}_gripper.force_limit"][0]) for side in SIDES)
+    return [(opening / 2, force / FINGER_STIFFNESS) for opening, force in zip(openings, forces)]
+
+
+def _driven(base: _Pose, twist: tuple[float, float], time: float) -> _Pose:
     """Where x, y, heading are after driving straight on or on an arc."""
     x, y, heading = base
+    forward, yaw_rate = twist
     middle = heading + yaw_rate * time / 2
     way = forward * time
-    return np.array([x + way * math.cos(middle), y + way * math.sin(middle), heading + yaw_rate * time])
+    return x + way * math.cos(middle), y + way * math.sin(middle), heading + yaw_rate * time
 
 
 def _add_gravity(
