@@ -28,7 +28,7 @@ from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
 PROBE = 0.02  # of the hand to both sides along each of its axes [m]
 DISTANCE = 0.78  # base to the panel [m]
 IMAGES = 8  # averaged at every place
-ENOUGH = 0.75  # share of them with the mark: noise may hide it from one or two
+ENOUGH = 0.5  # share of them in which the mark is found; noise hides it in one or two
 REFERENCES, PICTURES = "hands.yaml", {side: f"{side}.png" for side in SIDES}
 FILES = (REFERENCES, *PICTURES.values())
 HEADING = "Made by `valve-drake teach`."
