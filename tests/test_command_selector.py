@@ -1,6 +1,7 @@
 """command_selector: who commands what in which mode; nothing unbounded, stale or broken ever reaches the robot."""
 
 import dataclasses as dc
+import math
 
 import numpy as np
 import pytest
@@ -491,13 +492,20 @@ def test_braking_speed_falls_by_one_step_of_the_acceleration_each_step():
 
 
 def test_follow_lands_exactly_for_periods_that_are_no_power_of_two():
-    position, velocity, target = np.zeros(1), np.zeros(1), 0.0
+    position, velocity, target = 0.0, 0.0, 0.0
     for k in range(200):
-        before, target = target, 0.5 * (1 - np.cos(0.01 * k))
-        position, velocity = follow(
-            np.array([target]), np.array([(target - before) / 0.01]), position, velocity, 2.0, 9.0, 0.01
-        )
-        assert position[0] == target
+        before, target, last = target, 0.5 * (1 - math.cos(0.01 * k)), position
+        position = follow(target, (target - before) / 0.01, position, velocity, 2.0, 9.0, 0.01)
+        velocity = (position - last) / 0.01
+        assert position == target
+
+
+def test_a_target_that_is_no_number_is_not_followed_to_a_number():
+    assert math.isnan(follow(math.nan, math.nan, 0.3, 0.0, 1.0, 2.0, DT))
+
+
+def test_speeds_and_distances_without_bounds_are_followed_at_the_joints_own():
+    assert follow(1e308, 1e308, 0.0, 1.0, 1.0, 2.0, DT) == 1.0 * DT
 
 
 # ---------------------------------------------------------------- block

@@ -110,7 +110,8 @@ def apply(X: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 def planar(x: float, y: float, heading: float) -> np.ndarray:
     """X_OB of a base on the floor -> (3, 4)."""
-    return make(rot_z(heading), np.array([x, y, 0.0]))
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, 0.0]])
 
 
 def wrap(angle: float, period: float = 2 * np.pi) -> float:

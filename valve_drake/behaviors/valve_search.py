@@ -15,6 +15,7 @@ Sightings carry the camera's pose X_OL of their capture time: p_OV = X_OL p_LV h
 """
 
 import dataclasses as dc
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -112,18 +113,20 @@ class Memory:
     ignore_until: float = -np.inf  # capture time [s]
 
 
-def aim(head_pose: HeadPose, base: np.ndarray, torso: np.ndarray, p_OV: np.ndarray) -> np.ndarray:
-    """Neck pitch and yaw that bring p_OV nearer to the left camera's optical axis -> (2,).
+def aim(head_pose: HeadPose, base: np.ndarray, torso: np.ndarray, p_OV: np.ndarray) -> tuple[float, float]:
+    """Neck pitch and yaw that bring p_OV nearer to the left camera's optical axis.
 
     One step of a fixed-point iteration from `torso`: turn by the difference of azimuth and elevation between the axis
     and the line to the point. Exact but for the eye's offset from the neck, so each step divides the error by distance
     over offset (> 6); the caller takes one each tick, from its last result. Joint limits are the caller's.
     """
     X_OL = head_pose(base, torso)
-    axis, line = X_OL[:, 2], p_OV - X_OL[:, 3]
-    yaw = wrap(np.arctan2(line[1], line[0]) - np.arctan2(axis[1], axis[0]))
-    pitch = np.arctan2(axis[2], np.hypot(axis[0], axis[1])) - np.arctan2(line[2], np.hypot(line[0], line[1]))
-    return torso[1:] + [pitch, yaw]
+    x, y, z = X_OL[:, 2].tolist()
+    dx, dy, dz = (p_OV - X_OL[:, 3]).tolist()
+    _, pitch, yaw = torso.tolist()
+    yaw += wrap(math.atan2(dy, dx) - math.atan2(y, x))
+    pitch += math.atan2(z, math.hypot(x, y)) - math.atan2(dz, math.hypot(dx, dy))
+    return pitch, yaw
 
 
 def agree(config: ValveSearchConfig, looks: tuple[tuple[np.ndarray, float], ...], eye: np.ndarray) -> bool:
@@ -167,9 +170,14 @@ def step(
             blind = time - max(m.since, m.target_time)
             if blind > config.lost_after:
                 m = _end(m, "failed", Verdict.MARKER_LOST, f"marker not seen for {blind:.1f} s")
-        goal = _gaze(config, m, base, robot_state.torso[0], mode.mode in DRIVING, head_pose)
-    speed = np.array([config.waist_speed, config.neck_speed, config.neck_speed])
-    torso, velocity = follow(goal, (goal - m.goal) / dt, m.torso, m.velocity, speed, config.acceleration, dt)
+        waist = float(robot_state.torso[0])
+        goal = _gaze(config, m, base, waist, mode.mode in DRIVING, head_pose)
+    speed, now = (config.waist_speed, config.neck_speed, config.neck_speed), m.torso.tolist()
+    new = [
+        follow(*joint, config.acceleration, dt)
+        for joint in zip(goal.tolist(), ((goal - m.goal) / dt).tolist(), now, m.velocity.tolist(), speed)
+    ]
+    torso, velocity = np.array(new), np.array([(after - before) / dt for after, before in zip(new, now)])
     m = changed(m, torso=torso, velocity=velocity, goal=goal)
     return m, Command(time=time, torso=torso, base_twist=twist), _status(config, m, time, mode)
 
@@ -236,20 +244,24 @@ def _gaze(
 ) -> np.ndarray:
     """Torso goal that keeps the target centred; without a target the neck stays."""
     if m.target is None:
-        return np.array([0.0, m.goal[1], m.goal[2]])
-    pitch, yaw = aim(head_pose, base, np.array([waist, m.goal[1], m.goal[2]]), m.target)
+        return np.array([0.0, *m.goal.tolist()[1:]])
+    pitch, yaw = aim(head_pose, base, np.array([waist, *m.goal.tolist()[1:]]), m.target)
     # The waist turns by what the neck cannot, but only while the arms are folded.
-    beyond = waist + yaw - np.clip(waist + yaw, -config.sweep_yaw, config.sweep_yaw)
-    twist = float(np.clip(beyond, -config.sweep_waist, config.sweep_waist)) if driving else 0.0
+    beyond = waist + yaw - _within(waist + yaw, -config.sweep_yaw, config.sweep_yaw)
+    twist = _within(beyond, -config.sweep_waist, config.sweep_waist) if driving else 0.0
     return np.array([twist, *_neck(config, pitch, yaw)])
 
 
 def _neck(config: ValveSearchConfig, pitch: float, yaw: float) -> tuple[float, float]:
     """Neck pitch and yaw, clipped to the joints' limits."""
     return (
-        float(np.clip(pitch, config.pitch_low, config.pitch_high)),
-        float(np.clip(yaw, -config.yaw_limit, config.yaw_limit)),
+        _within(pitch, config.pitch_low, config.pitch_high),
+        _within(yaw, -config.yaw_limit, config.yaw_limit),
     )
+
+
+def _within(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
 
 
 # ---------------------------------------------------------------- search

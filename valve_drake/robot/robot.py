@@ -175,7 +175,7 @@ class Robot:
 
     def head_pose(self, base: np.ndarray, torso: np.ndarray) -> np.ndarray:
         """X_OL for base = (x, y, heading) in O -> (3, 4)."""
-        return compose(planar(*base), self.X_BL(torso))
+        return compose(planar(*base.tolist()), self.X_BL(torso))
 
     # ------------------------------------------------------------ arms
     def split(self, q: np.ndarray) -> dict[str, np.ndarray]:

@@ -294,39 +294,66 @@ def _base(m: Memory, wanted: np.ndarray | None, dt: float) -> tuple[np.ndarray, 
 def _joints(
     m: Memory, wanted: dict[str, np.ndarray], dt: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+    """Moves every joint one step -> position, velocity and target (17,), what was limited."""
     b = m.bounds
-    asked, held = m.position.copy(), np.ones(17, bool)
+    asked: list[float | None] = [None] * len(m.position)  # None: held
     for group, part in JOINTS.items():
         if group in wanted:
-            asked[part] = wanted[group][:1] if group in GRIPPERS else wanted[group]
-            held[part] = False
-    target = np.minimum(np.maximum(asked, b.low), b.high)
-    position, velocity = follow(target, (target - m.target) / dt, m.position, m.velocity, b.speed, b.acceleration, dt)
-    if held.any():
-        # A held joint has no target: it brakes, and stays.
-        stay = m.position
-        if m.velocity[held].any():
-            braked = np.sign(m.velocity) * np.maximum(np.abs(m.velocity) - b.acceleration * dt, 0.0)
-            # A joint that was measured outside its limits stays where it is until a command brings it back.
-            low, high = np.minimum(b.low, stay), np.maximum(b.high, stay)
-            stay = np.minimum(np.maximum(stay + braked * dt, low), high)
-        position = np.where(held, stay, position)
-        velocity = np.where(held, (stay - m.position) / dt, velocity)
+            asked[part] = wanted[group].tolist()[:1] if group in GRIPPERS else wanted[group].tolist()
+    now = m.position.tolist()
+    position, target = [], []
+    for want, low, high, last, at, rate, speed, acceleration in zip(
+        asked,
+        b.low.tolist(),
+        b.high.tolist(),
+        m.target.tolist(),
+        now,
+        m.velocity.tolist(),
+        b.speed.tolist(),
+        b.acceleration.tolist(),
+    ):
+        goal = min(max(at if want is None else want, low), high)
+        target.append(goal)
+        if want is None:
+            position.append(_braked(at, rate, low, high, acceleration, dt))
+        else:
+            position.append(follow(goal, (goal - last) / dt, at, rate, speed, acceleration, dt))
+    velocity = [(new - at) / dt for new, at in zip(position, now)]
+    limited = _limited(wanted, asked, target, position, velocity, b)
+    return np.array(position), np.array(velocity), np.array(target), limited
+
+
+def _braked(at: float, rate: float, low: float, high: float, acceleration: float, dt: float) -> float:
+    """A held joint has no target: it brakes, and stays."""
+    if rate == 0:
+        return at
+    speed = math.copysign(max(abs(rate) - acceleration * dt, 0.0), rate)
+    # A joint that was measured outside its limits stays where it is until a command brings it back.
+    return min(max(at + speed * dt, min(low, at)), max(high, at))
+
+
+def _limited(
+    wanted: dict[str, np.ndarray],
+    asked: list[float | None],
+    target: list[float],
+    position: list[float],
+    velocity: list[float],
+    b: Bounds,
+) -> list[str]:
+    """What of the commanded groups is not as it was asked."""
     limited: list[str] = []
-    if asked.tolist() == target.tolist() == position.tolist():  # nearly every tick
-        return position, velocity, target, limited
-    for group in wanted:
-        if group not in JOINTS:
+    for group, part in JOINTS.items():
+        if group not in wanted or asked[part] == target[part] == position[part]:  # nearly always
             continue
-        part = JOINTS[group]
-        if np.any(asked[part] != target[part]):
+        if asked[part] != target[part]:
             limited.append(f"{group}.position")
-        short = position[part] != target[part]
-        if np.any(short):
-            at_speed = np.abs(velocity[part]) >= b.speed[part] * (1 - 1e-9)
-            limited += [f"{group}.velocity"] if np.any(short & at_speed) else []
-            limited += [f"{group}.acceleration"] if np.any(short & ~at_speed) else []
-    return position, velocity, target, limited
+        short = [
+            "velocity" if abs(rate) >= speed * (1 - 1e-9) else "acceleration"
+            for goal, new, rate, speed in zip(target[part], position[part], velocity[part], b.speed[part].tolist())
+            if new != goal
+        ]
+        limited += [f"{group}.{kind}" for kind in ("velocity", "acceleration") if kind in short]
+    return limited
 
 
 def _force(config: CommandSelectorConfig, m: Memory, wanted: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str]]:
