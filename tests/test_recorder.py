@@ -150,6 +150,16 @@ def test_a_publish_sees_what_was_before_the_tick():
     assert times == [(k * TICK, (k + 1) * TICK) for k in range(32)]
 
 
+def test_a_followed_blocks_ports_are_read_after_its_updates_and_after_a_jump_in_time():
+    recorder = RecorderSystem(sink := Memory(), [output("a", "status", ms.Status)])
+    recorder.listen(lambda port: lambda time: ms.Status(time=time))
+    recorder.follow("a.status", block := SourceBlock("a", ms.Status, always(ms.Status())))
+    for tick, updates in ((0, 0), (1, 0), (2, 1), (3, 1), (5, 1), (6, 1)):
+        block.updates = updates
+        recorder.record(tick * TICK, tick * TICK)
+    assert [t / TICK for _, t in sink.of("/a/status")] == [0, 2, 5]
+
+
 def test_vectors_are_written_at_their_period():
     sink = run(Memory(), [vector("/a", "a", ("x", "y"), period=1 / 16)], {"a": [3.0, 4.0]})
     assert [t for _, t in sink.of("/a")] == [0, 1 / 16, 2 / 16, 3 / 16, 4 / 16]

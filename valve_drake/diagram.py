@@ -272,6 +272,8 @@ def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems
         block, output = source.split(".", 1)
         if not output.startswith("truth.") or (truth and output in exported):
             builder.Connect(systems[block].GetOutputPort(output), port)
+        if isinstance(systems[block], Block) and port.get_system() is recorder:
+            recorder.follow(port.get_name(), systems[block])
 
     for k in range(recorder.num_input_ports()):
         port = recorder.get_input_port(k)

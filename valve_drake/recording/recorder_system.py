@@ -12,7 +12,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, InputPort
 
 from valve_drake import profiling
-from valve_drake.ports import TICK, Kind, PythonSystem
+from valve_drake.ports import TICK, Block, Kind, PythonSystem
 from valve_drake.recording.schemas import Loggable, serialized
 
 ONCE = math.inf  # a period: at the start only
@@ -68,6 +68,8 @@ class RecorderSystem(PythonSystem):
     Publishes every TICK from 0, in the order of the rows. A publish at t sees the values before the updates at t: what
     the sensors show at t is written at t, what a block makes of it during the tick is written at t + TICK.
     The sink, and what was written last, are not part of the Context: a recorder serves one simulation.
+    From one tick to the next the ports of a block (`follow`) are read again only if it was updated: Drake takes some 3
+    us to say that a port shows what it showed before.
     """
 
     def __init__(self, sink: Sink, signals: Iterable[Signal], name: str = "recorder"):
@@ -78,6 +80,7 @@ class RecorderSystem(PythonSystem):
         self._rows = [_Row(signal, [self._declare(*port) for port in signal.inputs.items()]) for signal in signals]
         self._cycle = math.lcm(*(int(row.every) for row in self._rows if row.every != ONCE))  # [ticks]
         self._begun = False
+        self._next = 0  # the tick that follows the last one
         self._due = functools.cache(self._find_due)
         self.DeclarePeriodicPublishEvent(TICK, 0.0, self._publish)
 
@@ -97,6 +100,10 @@ class RecorderSystem(PythonSystem):
         for name, port in self._ports.items():
             port.listen(source(name))
 
+    def follow(self, name: str, block: Block[Any, Any]) -> None:
+        """Says whose output the port `name` shows: of a block in the same simulation."""
+        self._ports[name].block = block
+
     def _publish(self, context: Context) -> None:
         self.record(context.get_time(), context)
 
@@ -108,7 +115,12 @@ class RecorderSystem(PythonSystem):
                 self._rows = [row for row in self._rows if all(port.connected(where) for port in row.ports)]
             tick = round(time / TICK)
             rows, ports = self._due(tick if tick == 0 else tick % self._cycle or self._cycle)
+            jumped, self._next = tick != self._next, tick + 1
             for port in ports:
+                if port.block is not None:
+                    if port.updates == port.block.updates and not jumped:
+                        continue
+                    port.updates = port.block.updates
                 value = port.evaluate(where)
                 if value is not port.value:
                     port.check(value)
@@ -138,6 +150,8 @@ class _Port:
     def __init__(self, port: InputPort, kind: Kind):
         self.kind = kind
         self.value: Any = None
+        self.block: Block[Any, Any] | None = None  # whose output it shows, if that is known
+        self.updates = -1  # of the block when `value` was read
         self._port = port
         self.evaluate: Callable[[Any], Any] = port.Eval
         self.connected: Callable[[Any], bool] = port.HasValue
