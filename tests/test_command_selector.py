@@ -19,6 +19,7 @@ from valve_drake.supervisor.command_selector import (
     SOURCE,
     CommandSelectorConfig,
     bounds,
+    changes,
     outputs,
     start,
     step,
@@ -613,3 +614,10 @@ def test_whoever_commands_a_group_in_a_mode_is_awake_in_it():
     for mode, row in SOURCE.items():
         for block in {*row.values(), TABLE[mode].owner} & set(awake):
             assert awake[block] is None or mode in awake[block], f"{block} in {mode}"
+
+
+def test_ports_whose_value_stays_are_not_written_again():
+    before = start(CONFIG, INITIAL, ROBOT.arms)
+    assert changes(before, before) == {}
+    moved = dc.replace(before, position=before.position + np.eye(17)[4], twist=-before.twist)
+    assert set(changes(moved, before)) == {"left_arm.position_command", "base.twist_command"}  # -0.0 is not 0.0

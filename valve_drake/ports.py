@@ -195,7 +195,7 @@ class Block(PythonSystem, Generic[In, M]):
             else:
                 raise TypeError(f"{name}.{port}: an output is a message class or the size of a vector")
             self.DeclareStateOutputPort(port, state)
-        self.updates = 0  # made in any Context: while it stays, no output has changed
+        self.updates = 0  # of outputs, in any Context: while it stays, none has changed
         self.period = period
         self.schedule: list[tuple[float, float, Step]] = [
             (period, slot * SLOT + delay, self.step)
@@ -256,8 +256,9 @@ class Block(PythonSystem, Generic[In, M]):
         updated = self.update(work, context.get_time(), self.sources, context, memory.get_value())
         if updated is None:
             return _ASLEEP
-        self.updates += 1
         held, outputs = updated
+        if outputs:
+            self.updates += 1
         memory.set_value(held)
         for port, value in outputs.items():
             if port in self._messages:

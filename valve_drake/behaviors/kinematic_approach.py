@@ -149,7 +149,7 @@ class KinematicApproach:
         else:
             if mode.mode == Mode.SEARCH:
                 m = changed(m, stance=Stance(), stance_looks=())
-            m = self._homing(time, m, self._valve(m, state, turn))
+            m = self._homing(time, m, self._valve(m, state, turn) if m.phase == "start" else None)
         if m.path is not None:
             m = changed(m, q=m.path.sample(time))
         gripper = np.array([self.robot.opening, self.config.gripper_force])
@@ -172,7 +172,10 @@ class KinematicApproach:
         return X_BV if np.hypot(*X_BV[:2, 3]) < NEAR else None
 
     def _homing(self, time: float, m: Memory, X_BV: np.ndarray | None) -> Memory:
-        """Brings the arms home along a free path, once per activation; m.path is the move, phase "home" on arrival."""
+        """Brings the arms home along a free path, once per activation; m.path is the move, phase "home" on arrival.
+
+        X_BV: of a valve to keep clear of; read in phase "start" alone.
+        """
         if m.phase == "start":
             m = self._move(time, m, self.home, X_BV)
         if m.phase == "moving" and (m.path is None or time >= m.path.end()):

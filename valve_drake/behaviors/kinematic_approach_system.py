@@ -62,5 +62,5 @@ class KinematicApproachSystem(Block[KinematicApproachInputs, Memory]):
         }
 
     def later(self, time: float, inputs: KinematicApproachInputs, memory: Memory) -> tuple[Memory, Outputs]:
-        memory = self._law.watch_stance(time, memory, inputs.mode, inputs.estimate)
-        return memory, {"stance": memory.stance}
+        after = self._law.watch_stance(time, memory, inputs.mode, inputs.estimate)
+        return after, {} if after.stance is memory.stance else {"stance": after.stance}

@@ -4,6 +4,7 @@ Nothing is welded or moved by hand: the fingers hold the handles by friction and
 (plant_system.py). `truth.*` ports exist here only; the recorder alone reads them.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -72,7 +73,7 @@ class OdometrySystem(Block[OdometryInputs, tuple[np.ndarray, int]]):
     def __init__(self, error: ErrorConfig, seed: int):
         self._error = error
         self._noise = _Noise(seed, 1, 2)
-        self._scale = 1 + error.odometry_scale * _rng(seed, 0).standard_normal(2)
+        self._scale = (1 + error.odometry_scale * _rng(seed, 0).standard_normal(2)).tolist()
         super().__init__("odometry", slot=3)
 
     def initial(self) -> tuple[np.ndarray, int]:
@@ -81,15 +82,15 @@ class OdometrySystem(Block[OdometryInputs, tuple[np.ndarray, int]]):
     def step(
         self, time: float, inputs: OdometryInputs, memory: tuple[np.ndarray, int]
     ) -> tuple[tuple[np.ndarray, int], Outputs]:
-        (x, y, h, _, _), count = memory
-        _, _, heading, vx, vy, w = inputs.base
-        forward = vx * np.cos(heading) + vy * np.sin(heading)
-        noise = 1 + self._error.odometry_noise * self._noise(count)
-        forward, w = np.array([forward, w]) * self._scale * noise
-        middle = h + w * TICK / 2
-        new = np.array(
-            [x + forward * TICK * np.cos(middle), y + forward * TICK * np.sin(middle), h + w * TICK, forward, w]
-        )
+        last, count = memory
+        x, y, h, _, _ = last.tolist()
+        _, _, heading, vx, vy, w = inputs.base.tolist()
+        forward = vx * math.cos(heading) + vy * math.sin(heading)
+        draw, noise = self._noise(count).tolist(), self._error.odometry_noise
+        forward = forward * self._scale[0] * (1 + noise * draw[0])
+        w = w * self._scale[1] * (1 + noise * draw[1])
+        middle, way = h + w * TICK / 2, forward * TICK
+        new = np.array([x + way * math.cos(middle), y + way * math.sin(middle), h + w * TICK, forward, w])
         return (new, count + 1), {"odometry": new}
 
 

@@ -157,6 +157,12 @@ def outputs(memory: Memory) -> dict[str, np.ndarray]:
     return out
 
 
+def changes(memory: Memory, before: Memory) -> dict[str, np.ndarray]:
+    """Those of `outputs` that are not as they were: most joints stand still most of the time."""
+    was = outputs(before)
+    return {port: value for port, value in outputs(memory).items() if value.tobytes() != was[port].tobytes()}
+
+
 def step(
     config: CommandSelectorConfig,
     memory: Memory,

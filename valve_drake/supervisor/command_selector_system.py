@@ -11,6 +11,7 @@ from valve_drake.supervisor.command_selector import (
     PORTS,
     CommandSelectorConfig,
     Memory,
+    changes,
     outputs,
     start,
     step,
@@ -70,7 +71,7 @@ class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
 
     def step(self, time: float, inputs: CommandSelectorInputs, memory: Memory) -> tuple[Memory, Outputs]:
         commands = {name: inputs[name] for name in BEHAVIORS}
-        memory, report = step(
+        after, report = step(
             self.config, memory, time, self.period, inputs.mode, inputs.robot_state, inputs.health, commands
         )
-        return memory, outputs(memory) | {"report": report}
+        return after, changes(after, memory) | {"report": report}
