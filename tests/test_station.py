@@ -122,6 +122,20 @@ def true_arm(rig, side):
     return np.array([physics.plant.GetJointByName(name).get_angle(inner) for name in arm_joints(side)])
 
 
+def test_joints_bear_their_weight_without_a_sag(rig):
+    home = initial_commands(rig.scenario)
+    for side in SIDES:
+        np.testing.assert_allclose(true_arm(rig, side), home[f"{side}_arm.position_command"], atol=1e-6)
+    physics = rig.station.GetSubsystemByName("plant")
+    context = physics.plant_context(rig.context)  # which feeds gravity forward, too
+    port = physics.plant.get_net_actuation_output_port(physics.robot)
+    np.testing.assert_allclose(
+        port.Eval(context),
+        physics.GetOutputPort("actuation").Eval(physics.GetMyContextFromRoot(rig.context)),
+        atol=1e-3,
+    )
+
+
 def test_an_arm_with_a_wrong_zero_goes_to_where_its_encoders_read_the_command():
     error = ErrorConfig(arm_offset=0.004)
     offsets = simulated.arm_offsets(error, seed=3)

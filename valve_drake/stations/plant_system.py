@@ -15,22 +15,21 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import ModelInstanceIndex
-from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import (
     Context,
     Diagram,
     DiagramBuilder,
+    FixedInputPortValue,
     State,
 )
-from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
+from pydrake.systems.primitives import ConstantVectorSource
 
 from valve_drake import profiling
 from valve_drake.messages import SIDES
 from valve_drake.ports import SLOT, TICK, PythonSystem
 from valve_drake.robot.description import RobotDescription
 from valve_drake.stations.contract import CONTRACT
-from valve_drake.stations.scene import BASE, TORSO, add_robot, add_scene, arm_joints
+from valve_drake.stations.scene import BASE, TORSO, add_scene, arm_joints
 from valve_drake.stations.simulation_config import ValveConfig
 
 STEPS = 2  # of the plant in a tick; twice as many leave forces and angles as they are and double the work
@@ -70,8 +69,7 @@ class PlantSystem(PythonSystem):
 
     Servos: joints are implicit PD servos with effort limits. Arms and torso are sent positions, with v_d = 0. The
     base's set point is the integral of its twist. A finger's is clipped about its position at each step, so that the
-    servo's stiffness times the difference never exceeds the gripper's force limit. Gravity is fed forward from a model
-    of the robot alone.
+    servo's stiffness times the difference never exceeds the gripper's force limit. Gravity is fed forward, once a tick.
 
     plant, scene_graph, robot, valve: the MultibodyPlant, its geometry, its model instances; `plant_context` makes a
     Context for them. They belong to `diagram`, which nobody else advances. actuated: the robot's joints with an
@@ -109,10 +107,10 @@ class PlantSystem(PythonSystem):
             self.plant.GetJointByName(name, self.robot).set_default_positions([value])
         stem = self.plant.GetJointByName("stem", self.valve)
         stem.set_default_positions([valve.bar_angle + max(valve.position, 0.0)])
-        self._gravity = _add_gravity(builder, self.plant, self.robot, robot)
         still = builder.AddNamedSystem("valve_at_rest", ConstantVectorSource(np.zeros(2)))
         builder.Connect(still.get_output_port(), self.plant.get_desired_state_input_port(self.valve))
         builder.ExportInput(self.plant.get_desired_state_input_port(self.robot), "desired")
+        builder.ExportInput(self.plant.get_actuation_input_port(self.robot), "feed_forward")
         self.diagram: Diagram = builder.Build()
         self.diagram.set_name("plant_with_servos")
 
@@ -123,14 +121,15 @@ class PlantSystem(PythonSystem):
         self._zeros = np.concatenate([np.zeros(len(TORSO)), *(offsets[side] for side in SIDES)])
         self._base_at = [order.index(name) for name in BASE]
         self._fingers = [(order.index(name), joints[order.index(name)].position_start()) for name in fingers]
+        self._actuated_at = [joint.velocity_start() for joint in joints]
 
         self._inputs = {name: self.DeclareVectorInputPort(name, size) for name, size in COMMANDS.items()}
         self._scratch = self.diagram.CreateDefaultContext()
         self._lock = threading.Lock()  # of the scratch: two threads may advance two Contexts
         self._inner = self.plant.GetMyMutableContextFromRoot(self._scratch)
         desired = np.zeros(2 * len(joints))  # [q_d; v_d] of the robot's actuators
-        self._fixed = self.diagram.GetInputPort("desired").FixValue(self._scratch, desired)
-        self._desired = self._fixed.GetMutableData().get_mutable_value().get_mutable_value()  # its memory
+        self._fixed_desired, self._desired = self._fix("desired", desired)
+        self._fixed_feed_forward, self._feed_forward = self._fix("feed_forward", np.zeros(len(joints)))
         self._net_actuation = self.plant.get_net_actuation_output_port(self.robot)
         self._reaction_forces = self.plant.get_reaction_forces_output_port()
         self._loads = [self.plant.GetJointByName(name).index() for name in LOADED.values()]
@@ -160,7 +159,17 @@ class PlantSystem(PythonSystem):
         self._set_base(desired, tuple(base.tolist()), tuple(commands["base.twist_command"].tolist()), 0.0)
         self._set_fingers(desired, x, _grips(commands))
         self.diagram.GetInputPort("desired").FixValue(inner, desired)
+        self.diagram.GetInputPort("feed_forward").FixValue(inner, self._gravity(plant_context))
         return plant_context
+
+    def _fix(self, name: str, value: np.ndarray) -> tuple[FixedInputPortValue, np.ndarray]:
+        """Fixes an input of the scratch -> what tells the Context of a change, the memory to write it into."""
+        fixed = self.diagram.GetInputPort(name).FixValue(self._scratch, value)
+        return fixed, fixed.GetMutableData().get_mutable_value().get_mutable_value()
+
+    def _gravity(self, plant_context: Context) -> np.ndarray:
+        """What the robot's actuators do to bear its weight (n,) [N m, N]."""
+        return -self.plant.CalcGravityGeneralizedForces(plant_context)[self._actuated_at]
 
     def _commands(self, context: Context) -> dict[str, np.ndarray]:
         return {name: port.Eval(context) for name, port in self._inputs.items()}
@@ -206,8 +215,10 @@ class PlantSystem(PythonSystem):
         twist: tuple[float, float] = tuple(commands["base.twist_command"].tolist())
         grips = _grips(commands)
         scratch.SetDiscreteState(x)
+        self._fixed_feed_forward.GetMutableData()  # tells the Context that the memory of `_feed_forward` changes
+        self._feed_forward[:] = self._gravity(self._inner)
         for k in range(STEPS):
-            self._fixed.GetMutableData()  # tells the Context that `desired`, its memory, changes
+            self._fixed_desired.GetMutableData()  # as that of `_desired` does
             if k == 0:
                 self._set_joints(desired, commands)
             self._set_base(desired, start, twist, k * TICK / STEPS)
@@ -237,22 +248,6 @@ def _driven(base: _Pose, twist: tuple[float, float], time: float) -> _Pose:
     middle = heading + yaw_rate * time / 2
     way = forward * time
     return x + way * math.cos(middle), y + way * math.sin(middle), heading + yaw_rate * time
-
-
-def _add_gravity(
-    builder: DiagramBuilder, plant: MultibodyPlant, robot: ModelInstanceIndex, described: RobotDescription | None
-) -> MultibodyPlant:
-    """Feeds gravity forward to the robot's actuators -> the model that tells it, which must outlive the diagram."""
-    model = MultibodyPlant(plant.time_step())
-    add_robot(model, described)
-    model.Finalize()
-    mode = InverseDynamics.InverseDynamicsMode.kGravityCompensation
-    gravity = builder.AddNamedSystem("gravity_compensation", InverseDynamics(model, mode))
-    torques = builder.AddNamedSystem("gravity_torques", MatrixGain(model.MakeActuationMatrix().T))
-    builder.Connect(plant.get_state_output_port(robot), gravity.get_input_port_estimated_state())
-    builder.Connect(gravity.get_output_port_generalized_force(), torques.get_input_port())
-    builder.Connect(torques.get_output_port(), plant.get_actuation_input_port(robot))
-    return model
 
 
 def _leave_out_looks(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
