@@ -117,7 +117,8 @@ def transforms(time: float, tree: Iterable[tuple[str, str, np.ndarray]]) -> Enco
     """FrameTransforms: poses X (3, 4) of child frames in their parents, as (parent, child, X), valid at `time`."""
     parents, children, poses = zip(*tree)
     X = np.array(poses)
-    numbers = np.hstack([X[:, :, 3], quaternions(X[:, :, :3])])
+    numbers = np.empty((len(X), 7))
+    numbers[:, :3], numbers[:, 3:] = X[:, :, 3], quaternions(X[:, :, :3])
     return _tree(parents, children).fill(nanoseconds(time), numbers.ravel().tolist())
 
 

@@ -21,6 +21,7 @@ class RobotFrames:
         self._model = shared = robot.model
         self._plant, instance = shared.plant, shared.robot
         self._context = self._plant.CreateDefaultContext()
+        self._q = np.array(self._plant.GetPositions(self._context))
         self._poses = self._plant.get_body_poses_output_port()
         self._bodies = {
             int(i): f"robot::{self._plant.get_body(i).name()}" for i in self._plant.GetBodyIndices(instance)
@@ -44,7 +45,7 @@ class RobotFrames:
 
     def __call__(self, state: RobotState, estimate: RectangleEstimate, plan: GraspPlan, turn: TurnState) -> Transforms:
         """(parent, child, X) of all bodies, the head cameras and the valve; poses a display model only."""
-        q = np.array(self._plant.GetPositions(self._context))
+        q = self._q.copy()
         q[self._slots["base"]] = state.odometry[:3]
         q[self._slots["torso"]] = state.torso
         for side in SIDES:
