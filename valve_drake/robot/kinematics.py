@@ -33,6 +33,8 @@ _ENOUGH = 0.5  # margin at which no further seed is tried
 _ROOM = math.radians(40)  # to a joint limit that is comfortable
 _SINGULAR, _REGULAR = 0.05, 0.20  # least singular value of the scaled Jacobian at margins 0 and 1
 
+_UNITS = np.array([[1.0]] * 3 + [[LENGTH]] * 3)  # of a Jacobian's rows, for angles and lengths to compare
+
 PoseAndJacobian = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # q (n,) -> X_BG (3, 4), J (6, n): [w; v] in B
 
 
@@ -126,7 +128,7 @@ def pose_error(X: np.ndarray, X_goal: np.ndarray) -> np.ndarray:
 
 def solve(evaluate: PoseAndJacobian, X_goal: np.ndarray, start: np.ndarray, arm: Arm) -> np.ndarray | None:
     """The joints at X_goal that are reached from `start`, within the arm's limits; None if it does not get there."""
-    q = np.clip(start, arm.low, arm.high)
+    q = np.minimum(np.maximum(start, arm.low), arm.high)
     redundant = len(arm) > 6
     identity = np.eye(len(arm)) if redundant else _NONE
     patience, target = 0, math.inf
@@ -146,12 +148,12 @@ def solve(evaluate: PoseAndJacobian, X_goal: np.ndarray, start: np.ndarray, arm:
         if redundant:
             pull = min(0.05, 2 * math.sqrt(square)) * (arm.work - q)
             step = step + (identity - J.T @ np.linalg.solve(A, J)) @ pull
-        largest = float(np.abs(step).max())
+        largest = max(map(abs, step.tolist()))  # of so few numbers a third of numpy's time
         if largest > _STEP:
             step = step * (_STEP / largest)
         wanted = q + step
         q = np.minimum(np.maximum(wanted, arm.low), arm.high)
-        if largest < _LAST and np.array_equal(q, wanted):
+        if largest < _LAST and q.tolist() == wanted.tolist():
             return q
     return None
 
@@ -189,8 +191,8 @@ def search(
 
 def margin(q: np.ndarray, J: np.ndarray, arm: Arm) -> float:
     """See RobotKinematics.margin; J: its Jacobian there (6, n)."""
-    room = np.minimum(q - arm.low, arm.high - q) / np.minimum(_ROOM, (arm.high - arm.low) / 4)
-    scaled = J.copy()
-    scaled[3:] /= LENGTH
+    limits = zip(q.tolist(), arm.low.tolist(), arm.high.tolist())
+    room = min(min(at - low, high - at) / min(_ROOM, (high - low) / 4) for at, low, high in limits)
+    scaled = J / _UNITS
     least = math.sqrt(max(float(np.linalg.eigvalsh(scaled @ scaled.T)[0]), 0.0))
-    return min(1.0, float(room.min()), (least - _SINGULAR) / (_REGULAR - _SINGULAR))
+    return min(1.0, room, (least - _SINGULAR) / (_REGULAR - _SINGULAR))
