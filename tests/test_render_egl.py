@@ -1,7 +1,9 @@
 """render_egl: agrees with Drake's VTK renderer, and edges lie where they should."""
 
 import gc
+import math
 
+import cv2
 import numpy as np
 import pytest
 from pydrake.geometry import (
@@ -30,6 +32,7 @@ from valve_drake.camera.lens import Lens, load_head
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads
 from valve_drake.perception.quadrilateral import meet, side_lines
+from valve_drake.stations import render_egl
 from valve_drake.stations.camera_rig import CameraRig, _Lensed
 from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer, read_obj
 from valve_drake.stations.simulated import make_mounts
@@ -100,8 +103,8 @@ def test_the_markers_sides_lie_where_vtk_draws_them(rigs, place):
 # ---------------------------------------------------------------- the engine by itself
 
 
-def draw(shapes, engine="egl", info=INFO, X_WC=None, settings=None, then=None, channels=3):
-    """An image (H, W, 3) of [(shape, X_WG, rgba), ...] from X_WC."""
+def draw(shapes, engine="egl", info=INFO, X_WC=None, settings=None, then=None, channels=3, fine_within=None):
+    """An image (H, W, 3) of [(shape, X_WG, rgba), ...] from X_WC; fine_within: of the shapes of these numbers [m]."""
     scene = SceneGraph()
     source = scene.RegisterSource("test")
     ids = []
@@ -110,6 +113,8 @@ def draw(shapes, engine="egl", info=INFO, X_WC=None, settings=None, then=None, c
         properties = PerceptionProperties()
         if rgba is not None:
             properties.AddProperty("phong", "diffuse", Rgba(*rgba))
+        if k in (fine_within or {}):
+            properties.AddProperty("valve_drake", "fine_within", fine_within[k])
         instance.set_perception_properties(properties)
         ids.append(scene.RegisterAnchoredGeometry(source, instance))
     if engine == "egl":
@@ -314,6 +319,61 @@ def test_supersampling_is_the_mean_of_the_points():
     assert np.abs(draw(scene, settings={"supersample": 2}) - points).max() <= 0.5
     with pytest.raises(ValueError, match="1, 2, 3 or 4, got 2.5"):
         RenderEngineEgl(supersample=2.5)
+
+
+def test_what_is_fine_has_all_its_points_and_the_rest_one():
+    slanted = (0, 0, 0.3)
+    scene = [  # two plates before a wall, one in each half of the picture
+        (Box(0.2, 0.2, 0.01), at(-0.3, 0.1, 1.0, *slanted), (0.9, 0.1, 0.1, 1.0)),
+        (Box(0.2, 0.2, 0.01), at(0.5, -0.1, 2.0, *slanted), (0.1, 0.9, 0.1, 1.0)),
+        (Box(9.0, 9.0, 0.01), at(0, 0, 3.0), (0.5, 0.5, 0.9, 1.0)),
+    ]
+
+    def mixed(image):  # pixels that are partly wall and partly plate
+        return ((image != image[0, 0]).any(axis=-1) & (image != image[150, 80]).any(axis=-1))[:, :160]
+
+    fours = draw(scene, settings={"supersample": 2})
+    assert mixed(fours).sum() > 100
+    for plate in (0.99, 1.01):  # just farther off than that, and just nearer
+        part = draw(scene, settings={"supersample": 2}, fine_within={0: plate, 1: 1.9, 2: 0.0})
+        assert (part[:, :160] == fours[:, :160]).all() == (plate > 1.0)
+        assert (part[:, 160:] != fours[:, 160:]).any()
+        assert np.abs(part.astype(int) - fours).mean() < 0.3
+    always = draw(scene, settings={"supersample": 2}, fine_within={2: 0.0})
+    assert (always == fours).all()
+    ones = draw(scene, settings={"supersample": 1})
+    assert (draw(scene, settings={"supersample": 1}, fine_within={2: 0.0}) == ones).all()
+
+
+def test_a_picture_full_of_edges_is_fine_throughout():
+    stripes = [(Box(0.02, 2, 0.01), at(x, 0, 1.0, 0, 0, 0.3), (0.9, 0.9, 0.9, 1.0)) for x in np.arange(-0.8, 0.8, 0.05)]
+    coarse = dict.fromkeys(range(len(stripes)), 0.0)
+    fours = draw(stripes, settings={"supersample": 2})
+    assert (draw(stripes, settings={"supersample": 2}, fine_within=coarse) == fours).all()
+    few = draw(stripes[::9], settings={"supersample": 2}, fine_within=coarse)
+    assert (few != draw(stripes[::9], settings={"supersample": 2})).any()
+
+
+@pytest.mark.parametrize(
+    "body, distance, fine", [("marker", 1.8, True), ("handle_1", 0.3, True), ("handle_1", 1.0, False)]
+)
+def test_what_is_measured_is_drawn_as_in_a_picture_that_is_fine_throughout(rigs, monkeypatch, body, distance, fine):
+    ours, q = rigs[0], positions(rigs[0], -3.0, 0.0)
+    ours.pose(q)
+    frame = ours.plant.GetFrameByName(body, ours.scene.valve)
+    X = ours.plant.CalcRelativeTransform(ours._plant_context, ours.plant.world_frame(), frame)
+    X_WC = (X @ at(0, 0, -distance, 0, 0, 0.2)).GetAsMatrix34()  # seen from straight ahead, turned
+    images = []
+    for busy in (math.inf, -1.0):  # no picture has too many edges for one point, or every one
+        monkeypatch.setattr(render_egl, "_BUSY", busy)
+        images.append(ours.view(X_WC, q, 640, 480, 0.8))
+    part, whole = images
+    assert (part != whole).any()
+    channel = 0 if body == "marker" else 1
+    mark = (whole[..., channel] > 60) & (whole[..., channel] > 2.0 * whole[..., 1 - channel])
+    assert mark.sum() > 100
+    around = cv2.dilate(mark.astype(np.uint8), np.ones((7, 7))) > 0
+    assert (part == whole)[around].all() == fine
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ It is converted in `_Lensed.__init__` alone.
 
 import dataclasses as dc
 import functools
+import math
 import typing
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -22,13 +23,15 @@ from pydrake.geometry import (
     ColorRenderCamera,
     LightParameter,
     MakeRenderEngineVtk,
+    PerceptionProperties,
     RenderCameraCore,
     RenderEngineVtkParams,
+    Role,
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-from pydrake.multibody.tree import Frame
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from pydrake.systems.framework import Context, DiagramBuilder, State
 from pydrake.systems.sensors import CameraInfo
 
@@ -38,7 +41,7 @@ from valve_drake.frames import compose, inverse, make, rot_z
 from valve_drake.messages import CameraFrame
 from valve_drake.ports import PythonSystem
 from valve_drake.robot.description import RobotDescription
-from valve_drake.stations.render_egl import RenderEngineEgl, add_renderer
+from valve_drake.stations.render_egl import FINE, RenderEngineEgl, add_renderer
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.simulation_config import CameraConfig, LightConfig, ValveConfig
 
@@ -112,6 +115,9 @@ def lights(config: LightConfig) -> list[LightParameter]:
 
 RENDERER = "cameras"  # its name in the rig's SceneGraph
 BACKGROUND = (0.80, 0.85, 0.90)
+# Up to which distance the edges of the valve's visuals are measured, by name [m]: the marker's always, those of the
+# handles' marks by the wrist cameras alone (of the head cameras' images, from farther off, only their middles count).
+FINE_WITHIN = {"marker": math.inf, "mark_1": 0.5, "mark_2": 0.5}
 
 
 Needed = Callable[[CameraInfo], np.ndarray]  # as of RenderEngineEgl
@@ -125,6 +131,21 @@ def _add_vtk(scene_graph: SceneGraph, lights: list[LightParameter], supersample:
 def _add_egl(scene_graph: SceneGraph, lights: list[LightParameter], supersample: int, needed: Needed) -> None:
     engine = RenderEngineEgl(lights, BACKGROUND, supersample=supersample, needed=needed)
     add_renderer(scene_graph, RENDERER, engine)
+
+
+def _draw_finely(plant: MultibodyPlant, scene_graph: SceneGraph, valve: ModelInstanceIndex) -> None:
+    """What is measured in images is drawn with many points a pixel, the rest with one. Before a renderer is added."""
+    inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+    assert source is not None  # the plant has its geometry there
+    body = plant.GetFrameByName("marker", valve).body()
+    measured = {
+        id: FINE_WITHIN.get(inspector.GetName(id).split("::")[-1], 0.0) for id in plant.GetVisualGeometriesForBody(body)
+    }
+    for id in inspector.GetAllGeometryIds(Role.kPerception):
+        properties = PerceptionProperties(inspector.GetPerceptionProperties(id))
+        properties.AddProperty(*FINE, measured.get(id, 0.0))
+        scene_graph.RemoveRole(source, id, Role.kPerception)  # Drake replaces no perception properties
+        scene_graph.AssignRole(source, id, properties)
 
 
 RENDERERS = {"egl": _add_egl, "vtk": _add_vtk}  # scenario key simulation.camera.renderer
@@ -148,6 +169,7 @@ class CameraRig:
         scene_graph.set_name("scene_graph")
         self.scene = add_scene(self.plant, valve, marker_size, robot)
         self.plant.Finalize()
+        _draw_finely(self.plant, scene_graph, self.scene.valve)
         self._lensed = {name: _Lensed(mount.lens) for name, mount in mounts.items()}
         RENDERERS[camera.renderer](scene_graph, lights(light), camera.supersample, self._needed)
         self._scene_graph = scene_graph
@@ -250,7 +272,7 @@ def decode_image(data: bytes) -> np.ndarray:
     try:
         # The EXIF orientation is not applied: a calibration refers to the sensor's own pixels.
         flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if b"\xff\xd9" in data else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data.rfind(b"\xff\xd9") >= 0 else None
     except (cv2.error, MemoryError):
         image = None
     if image is None:

@@ -70,7 +70,7 @@ class CameraConfig(Config):
     wrist_focal: Number = number(480.0, 200.0, 900.0, "[px]")
     jpeg_quality: int = number(95, 50, 100, "of JPEG")
     renderer: str = choice("egl", ("egl", "vtk"), "egl: this program's own (render_egl.py); vtk: Drake's, slower")
-    supersample: int = number(2, 1, 4, "of egl: a pixel is the mean of so many points a side; vtk has four points")
+    supersample: int = number(2, 1, 4, "of egl: points a side of a pixel where edges are measured; vtk has four points")
 
     def relations(self, key: str) -> None:
         for name in ("head_period", "wrist_period", "latency"):
