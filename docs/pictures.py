@@ -10,11 +10,12 @@ import numpy as np
 from valve_drake import resources
 from valve_drake import scenario as scenarios
 from valve_drake.analysis.metrics import summarize
+from valve_drake.analysis.traces import Traces
 from valve_drake.camera.lens import load_head
 from valve_drake.frames import make
 from valve_drake.recording.reader import LogReader
+from valve_drake.robot.robot import Robot
 from valve_drake.stations.camera_rig import CameraRig
-from valve_drake.stations.scene import BASE, TORSO, arm_joints
 from valve_drake.stations.simulated import make_mounts
 
 
@@ -26,18 +27,19 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     return make(np.column_stack([x, np.cross(z, x), z]), eye)
 
 
-def positions(rig: CameraRig, reader: LogReader, bar_angle: float, time: float) -> np.ndarray:
+def positions(rig: CameraRig, reader: LogReader, robot: Robot, bar_angle: float, time: float) -> np.ndarray:
     """The plant's positions (n,) that the log has at `time` [s]."""
 
     def at(topic: str) -> Any:
         return next(m for _, _, m in reader.messages([topic], start=time))
 
     states = {j.name: j.position for j in at("/joint_states").joints}
-    values = dict(zip(BASE, at("/truth/base_pose").values))
-    for side in ("left", "right"):
-        values |= {name: states[name] for name in arm_joints(side)}
-        values |= {f"{side}_finger_{k}": states[f"{side}_gripper"] / 2 for k in (1, 2)}
-    values |= {name: states[name] for name in TORSO}
+    values = robot.named(
+        base=at("/truth/base_pose").values,
+        torso=[states[name] for name in robot.torso.names],
+        arms={side: np.array([states[name] for name in arm.names]) for side, arm in robot.arms.items()},
+        opening=states["left_gripper"],
+    )
     values["stem"] = bar_angle + at("/truth/valve_angle").values[0]
     q = np.zeros(rig.plant.num_positions())
     for name, value in values.items():
@@ -48,11 +50,13 @@ def positions(rig: CameraRig, reader: LogReader, bar_angle: float, time: float) 
 def main(log: Path, folder: Path) -> None:
     reader = LogReader(log)
     scenario = scenarios.parse(reader.metadata["run"]["scenario"], "log")
+    robot = Traces(reader).robot
+    assert robot is not None
     simulation = scenario.simulation
     simulation.light.intensity, simulation.light.fill = 0.95, 0.35
     head = load_head(resources.find(scenario.head_calibration, resources.models()))
     rig = CameraRig(
-        make_mounts(head, simulation, scenario.seed),
+        make_mounts(head, simulation, scenario.seed, robot.description.cameras),
         simulation.valve,
         tuple(scenario.marker.size),
         simulation.light,
@@ -81,7 +85,7 @@ def main(log: Path, folder: Path) -> None:
         ),
     }
     for name, (time, eye, target, fov) in shots.items():
-        q = positions(rig, reader, simulation.valve.bar_angle, time)
+        q = positions(rig, reader, robot, simulation.valve.bar_angle, time)
         image = rig.view(look_at(eye, target), q, 2560, 1600, np.radians(fov))
         image = cv2.resize(image, (1280, 800), interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(folder / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))

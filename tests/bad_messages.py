@@ -4,12 +4,12 @@ import math
 import struct
 
 import numpy as np
+from robot_facts import SIZES
 
 from valve_drake.stations.camera_rig import encode_frame
-from valve_drake.stations.contract import CAMERAS, CONTRACT
+from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.lcm_channels import CHANNELS, UNCOUNTED, image_message, signal
 
-SIZES = {spec.name: spec.kind for spec in CONTRACT if isinstance(spec.kind, int)}
 WILD = (math.nan, math.inf, -math.inf, 1e300, -1e300, 2.0**63, 0.5, 0.0, -1.0)
 STAMPS = (0, 1, -1, 2**63 - 1, -(2**63), 2**62, 10**12)
 NAMES = ("", "nose", "turn", "instance", "tick", "protocol", "estop", "x" * 5000, "\x1b[31m", *CAMERAS)

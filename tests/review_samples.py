@@ -7,7 +7,7 @@ the valve turns by ANGLE between 3.5 s and 4.5 s, and servo is entered twice.
 import cv2
 import numpy as np
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
-from robot_facts import ROBOT
+from robot_facts import GROUPS, ROBOT
 
 from valve_drake.frames import compose, inverse, make, planar, rot_y, rot_z, rotation
 from valve_drake.messages import (
@@ -27,8 +27,9 @@ from valve_drake.messages import (
 )
 from valve_drake.recording import foxglove
 from valve_drake.recording.schemas import Vector, Wrench
-from valve_drake.recording.signals import BEHAVIORS, TORSO, TRUTH
+from valve_drake.recording.signals import BEHAVIORS, TRUTH
 from valve_drake.recording.writer import LogWriter
+from valve_drake.robot.groups import GROUPS as ROBOT_GROUPS
 
 TICK = 1 / 128
 END = 6.0
@@ -51,7 +52,7 @@ SIGMA = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 2e-3])
 LAG = 0.002  # [rad]
 FORCE, STEM, TORQUE = 20.0, 0.5, 5.5
 SCENARIO = "seed: 7\ncommand: open\nsimulation:\n  valve: {friction: 5.1}\n"
-JOINTS = (*TORSO, *(f"{side}_arm_{k}" for side in SIDES for k in range(1, 7)))
+JOINTS = tuple(name for group in ROBOT_GROUPS for name in GROUPS.names(group))
 HOME = {"waist": 0.1, "neck_pitch": 0.2}
 
 
@@ -121,7 +122,7 @@ def camera_images(t, k):
 
 def every_tick(t, k):
     index, (since, mode, _, _) = mode_at(t)
-    q = dict(zip(TORSO, torso(t)))
+    q = dict(zip(GROUPS.torso, torso(t)))
     yield "/joint_states", joints(q, velocity=0.1)
     yield "/joint_commands", joints({name: q.get(name, 0.5) + LAG for name in JOINTS})
     for side in SIDES:

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from robot_facts import ROBOT
 
 from valve_drake import resources, scenario
 from valve_drake.camera.lens import load_head
@@ -21,7 +22,7 @@ from valve_drake.stations.simulated import make_mounts
 def rig_arguments():
     sc = scenario.resolve(scenario.load(None, ["seed=5", "simulation.camera.noise=2", "simulation.camera.blur=0.5"]))
     head = load_head(resources.find(sc.head_calibration, resources.models()))
-    mounts = make_mounts(head, sc.simulation, 5)
+    mounts = make_mounts(head, sc.simulation, 5, ROBOT.description.cameras)
     return mounts, sc.simulation.valve, tuple(sc.marker.size), sc.simulation.light, sc.simulation.camera, 5
 
 

@@ -6,16 +6,17 @@ import math
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
-from robot_facts import HOME, LIMITS, ROBOT, arm
+from robot_facts import GROUPS as ROBOT_GROUPS
+from robot_facts import HOME, LIMITS, ROBOT, arm, robot_state
 
 from valve_drake.checks import ConfigError
-from valve_drake.messages import Command, Health, Mode, ModeState, RobotState, SelectorReport, Verdict
+from valve_drake.messages import Command, Health, Mode, ModeState, SelectorReport, Verdict
 from valve_drake.motion import braking_speed, follow
+from valve_drake.stations.contract import vectors
 from valve_drake.supervisor.command_selector import (
     GRIPPERS,
     GROUPS,
     JOINTS,
-    PORTS,
     SOURCE,
     CommandSelectorConfig,
     bounds,
@@ -29,8 +30,9 @@ from valve_drake.task.modes import BEHAVIORS, TABLE
 
 DT = 1 / 128
 CONFIG = CommandSelectorConfig()
+PORTS = vectors(ROBOT_GROUPS, "in")
 INITIAL = {port: np.full(size, 0.01) for port, size in PORTS.items()}
-BOUNDS = bounds(CONFIG, ROBOT.arms)
+BOUNDS = bounds(CONFIG, ROBOT.torso, ROBOT.arms)
 
 
 def command(time: float, **groups) -> Command:
@@ -51,13 +53,11 @@ class Bench:
 
     def __init__(self, mode: Mode = Mode.REACH, config: CommandSelectorConfig = CONFIG):
         self.config = config
-        self.memory = start(config, INITIAL, ROBOT.arms)
+        self.memory = start(config, INITIAL, ROBOT.torso, ROBOT.arms)
         self.tick_count = 0
         self.mode = ModeState(mode=mode.value, activation=1)
         self.health = Health()
-        self.robot = RobotState(
-            torso=np.zeros(3), left_arm=HOME, right_arm=arm("right", HOME), history=np.zeros((1, 7)), left_gripper=0.02
-        )
+        self.robot = robot_state(left_arm=HOME, right_arm=arm("right", HOME), left_gripper=0.02)
         self.robot_age = self.mode_age = self.command_age = 0.0
 
     def tick(self, commands=None, **groups) -> SelectorReport:
@@ -159,7 +159,7 @@ def test_the_first_arm_command_is_the_measured_position():
     bench = Bench()
     bench.robot = dc.replace(bench.robot, left_arm=HOME + 0.4)
     bench.tick()
-    step_limit = BOUNDS.acceleration[JOINTS["left_arm"]] * DT * DT
+    step_limit = BOUNDS.acceleration[BOUNDS.parts["left_arm"]] * DT * DT
     assert np.all(np.abs(bench.out("left_arm.position_command") - (HOME + 0.4)) <= step_limit + 1e-12)
 
 
@@ -180,9 +180,9 @@ def test_before_the_first_valid_robot_state_the_outputs_are_the_initial_values(b
 def test_initial_values_that_do_not_fit_are_refused_by_port():
     for wrong in (np.zeros(5), np.full(6, np.nan)):
         with pytest.raises(ConfigError, match="left_arm.position_command"):
-            start(CONFIG, INITIAL | {"left_arm.position_command": wrong}, ROBOT.arms)
+            start(CONFIG, INITIAL | {"left_arm.position_command": wrong}, ROBOT.torso, ROBOT.arms)
     with pytest.raises(ConfigError, match="right_gripper.force_limit"):
-        start(CONFIG, {p: v for p, v in INITIAL.items() if p != "right_gripper.force_limit"}, ROBOT.arms)
+        start(CONFIG, {p: v for p, v in INITIAL.items() if p != "right_gripper.force_limit"}, ROBOT.torso, ROBOT.arms)
 
 
 # ---------------------------------------------------------------- limits
@@ -207,7 +207,7 @@ def follow_joint(targets: np.ndarray, group: str = "left_arm", joint: int = 0, m
 @pytest.mark.parametrize("group, joint", [("left_arm", 0), ("left_arm", 5), ("torso", 2), ("torso", 0)])
 def test_a_step_becomes_a_trapezoid_that_does_not_overshoot(group, joint, size):
     size = np.clip(size, -0.5, 0.5) if group == "torso" else size
-    k = JOINTS[group].start + joint
+    k = BOUNDS.parts[group].start + joint
     out, _ = follow_joint(np.concatenate([[0.0], np.full(400, size)]), group, joint)
     speed = np.diff(out) / DT
     assert out[-1] == size
@@ -304,7 +304,7 @@ def test_a_joint_measured_outside_its_limits_is_brought_back_without_a_jump():
         now = bench.out("torso.position_command")[0]
         assert before is None or 0 <= before - now <= BOUNDS.speed[0] * DT + 1e-12
         before = now
-    assert now == CONFIG.torso_high[0]
+    assert now == ROBOT.torso.high[0]
 
 
 # ---------------------------------------------------------------- refusals, staleness, holding
@@ -339,10 +339,10 @@ def test_stale_input_holds_the_joints_still_and_brakes_the_base(stale):
     setattr(bench, stale, 0.05)
     assert "hold" not in bench.tick(left_arm=HOME + 0.25).source
     setattr(bench, stale, 0.15)
-    moving = bench.memory.velocity[JOINTS["left_arm"]]
+    moving = bench.memory.velocity[BOUNDS.parts["left_arm"]]
     for _ in range(128):
         report = bench.tick(left_arm=HOME + 3.0, base_twist=np.array([0.3, 0.5]))
-        now = bench.memory.velocity[JOINTS["left_arm"]]
+        now = bench.memory.velocity[BOUNDS.parts["left_arm"]]
         assert np.all(np.abs(now) <= np.abs(moving))
         moving = now
     assert set(report.source) == {"hold"} and report.refused
@@ -377,7 +377,7 @@ def test_hold_brakes_within_the_acceleration_limit_and_inside_the_range():
             after = bench.memory.velocity[4]
             at_limit = bench.out("left_arm.position_command")[1] == limit
             assert 0 <= after <= before
-            assert at_limit or before - after <= CONFIG.arm_acceleration[1] * DT * (1 + 1e-9)
+            assert at_limit or before - after <= CONFIG.acceleration_arm * DT * (1 + 1e-9)
             assert bench.out("left_arm.position_command")[1] <= limit
         assert after == 0
 
@@ -513,13 +513,13 @@ def test_speeds_and_distances_without_bounds_are_followed_at_the_joints_own():
 
 
 def rig(**inputs) -> Rig:
-    robot = RobotState(left_arm=HOME, right_arm=arm("right", HOME), history=np.zeros((1, 7)))
+    robot = robot_state(left_arm=HOME, right_arm=arm("right", HOME))
     fixed = {"mode": ModeState(mode="reach", activation=1), "robot_state": robot, "health": Health()}
-    return Rig(CommandSelectorSystem(CONFIG, INITIAL, ROBOT.arms), **fixed | inputs)
+    return Rig(CommandSelectorSystem(CONFIG, INITIAL, ROBOT.torso, ROBOT.arms), **fixed | inputs)
 
 
 def test_ports():
-    assert ports(CommandSelectorSystem(CONFIG, INITIAL, ROBOT.arms)) == {
+    assert ports(CommandSelectorSystem(CONFIG, INITIAL, ROBOT.torso, ROBOT.arms)) == {
         "mode": "in abstract",
         "robot_state": "in abstract",
         "health": "in abstract",
@@ -530,9 +530,8 @@ def test_ports():
 
 
 def test_output_ports_are_the_stations_command_ports():
-    from valve_drake.stations.contract import CONTRACT
-
-    assert PORTS == {spec.name: spec.kind for spec in CONTRACT if spec.direction == "in"}
+    block = CommandSelectorSystem(CONFIG, INITIAL, ROBOT.torso, ROBOT.arms)
+    assert {p: int(k.removeprefix("out ")) for p, k in ports(block).items() if p in PORTS} == PORTS
 
 
 def test_block_holds_the_initial_values_until_its_first_step_and_again_after_initialising():
@@ -565,7 +564,7 @@ def test_block_holds_its_outputs_between_updates():
 
 def test_block_clones_are_independent():
     def make():
-        return rig(robot_state=RobotState(time=0.5, left_arm=HOME, history=np.zeros((1, 7))))
+        return rig(robot_state=robot_state(time=0.5, left_arm=HOME))
 
     change = {"mode": ModeState(mode="failed", activation=2, time=0.5)}
     assert_clones_are_independent(make, change, (*PORTS, "report"))
@@ -575,22 +574,20 @@ def test_block_refuses_a_wrong_message_and_a_wrong_config():
     with pytest.raises(TypeError, match="want Command"):
         rig(image_servo=ModeState()).run(0.1)
     with pytest.raises(ConfigError, match="initial"):
-        CommandSelectorSystem(CONFIG, {}, ROBOT.arms)
+        CommandSelectorSystem(CONFIG, {}, ROBOT.torso, ROBOT.arms)
 
 
 @pytest.mark.parametrize(
     "changes, words",
     [
-        ({"arm_speed": [1.0]}, "command_selector.arm_speed"),
-        ({"arm_speed": [1.0, 1, 1, 1, 1, float("nan")]}, "command_selector.arm_speed"),
+        ({"acceleration_arm": float("nan")}, "command_selector.acceleration_arm"),
         ({"base_acceleration": [0.0, 1.0]}, "command_selector.base_acceleration"),
-        ({"torso_low": [1.0, -0.5, -1.6]}, "command_selector.torso_low"),
         ({"trip_force": -1.0}, "command_selector.trip_force"),
     ],
 )
 def test_bad_config_is_refused_by_name(changes, words):
     with pytest.raises(ConfigError, match=words):
-        CommandSelectorSystem(CommandSelectorConfig(**changes), INITIAL, ROBOT.arms)
+        CommandSelectorSystem(CommandSelectorConfig(**changes), INITIAL, ROBOT.torso, ROBOT.arms)
 
 
 def test_verdicts_and_modes_travel_as_plain_text():

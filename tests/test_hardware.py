@@ -8,6 +8,7 @@ import pytest
 from bad_messages import bad_messages, on
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
+from robot_facts import GROUPS
 
 from valve_drake import diagram, drawing, resources
 from valve_drake import scenario as scenarios
@@ -17,7 +18,7 @@ from valve_drake.ports import SLOT, TICK
 from valve_drake.stations import hardware, lcm_channels
 from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_rig import encode_frame
-from valve_drake.stations.contract import CAMERAS, CONTRACT, check_contract
+from valve_drake.stations.contract import CAMERAS, check_contract, vectors
 from valve_drake.stations.hardware import SPEEDS, RobotLink, make_hardware_station
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
@@ -34,8 +35,7 @@ from valve_drake.stations.lcm_channels import (
     to_utime,
 )
 
-OUT = {spec.name: spec.kind for spec in CONTRACT if spec.direction == "out" and isinstance(spec.kind, int)}
-IN = {spec.name: spec.kind for spec in CONTRACT if spec.direction == "in"}
+OUT, IN = vectors(GROUPS, "out"), vectors(GROUPS, "in")
 DOCS = Path(__file__).resolve().parent.parent / "docs" / "hardware.md"
 GREY = np.full((16, 16, 3), 90, np.uint8)
 
@@ -52,7 +52,7 @@ class Puppet:
         lcm = DrakeLcm("memq://")
         self.config = HardwareConfig(answer_time=0.05, image_size=[16, 16], **hardware)
         self.told: list[str] = []
-        self.link = RobotLink(Bus(self.config, lcm), notice=self.told.append)
+        self.link = RobotLink(Bus(self.config, lcm), GROUPS, notice=self.told.append)
         self.link.clock = lambda: self.now
         self.now = 100.0
         self.bus = Bus(self.config, lcm)
@@ -183,7 +183,7 @@ def test_the_diagrams_are_the_same_object_for_object_but_for_the_station(both):
     blocks = [[(b.get_name(), type(b)) for b in s.diagram.GetSystems() if b is not s.station] for s in systems]
     assert blocks[0] == blocks[1]
     for system in systems:
-        check_contract(system.station)
+        check_contract(system.station, GROUPS)
     inside = {b.get_name() for b in systems[1].station.GetSystems()}
     assert inside == {"lcm_receiver", "lcm_sender"}
 

@@ -5,6 +5,7 @@ import dataclasses as dc
 import numpy as np
 import pytest
 import review_samples as sample
+from robot_facts import GROUPS
 
 from valve_drake.analysis import integrity
 from valve_drake.analysis.metrics import summarize
@@ -243,7 +244,7 @@ def test_a_steady_block_is_held_to_its_own_rate(tmp_path):
 
 def test_the_tables_of_rates_agree_with_the_recorders_own():
     calibrations = {camera: ((4, 4), np.eye(3)) for camera in integrity.CAMERAS}
-    table = signals(lambda *_: (), calibrations=calibrations)
+    table = signals(GROUPS, lambda *_: (), calibrations=calibrations)
     topics = {row.topic for row in table}
     assert set(integrity.PERIODS) <= topics and integrity.GATED <= topics and integrity.STEADY <= topics
     assert not (set(integrity.PERIODS) & integrity.STEADY or integrity.GATED & integrity.STEADY)

@@ -13,7 +13,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
-from robot_facts import ROBOT
+from robot_facts import GROUPS, ROBOT, robot_state
 
 from valve_drake import frames, profiling, resources
 from valve_drake import messages as ms
@@ -27,7 +27,7 @@ from valve_drake.recording.recorder_system import ONCE, RecorderSystem, Signal
 from valve_drake.recording.robot_frames import RobotFrames
 from valve_drake.recording.scene import parts_of, scene
 from valve_drake.recording.schemas import Vector, Wrench, parsed
-from valve_drake.recording.signals import JOINED, MEASURED, as_it_is, joints, output, signals, status_line, vector
+from valve_drake.recording.signals import JOINED, as_it_is, joints, measured, output, signals, status_line, vector
 from valve_drake.recording.writer import LogWriter
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
@@ -109,7 +109,7 @@ def mode(t: float) -> ms.ModeState:
 
 
 RUN = {
-    "robot_state.robot_state": lambda t: ms.RobotState(time=t),
+    "robot_state.robot_state": lambda t: robot_state(time=t),
     "color_segmentation.segmentation": pair,
     "line_fitting.edges": lambda t: ms.MarkerEdges(t, int(t * 8) // 2 * 2, *[ms.QuadEdges(True)] * 2),
     "handle_marker.marks": marks,
@@ -122,7 +122,7 @@ RUN = {
 
 def table():
     looks = scene([("base", Box(1, 2, 3), np.eye(3, 4), (1, 0, 0, 1))])
-    return signals(robot_frames, looks, {"head_left": ((640, 480), K), "head_right": ((640, 480), K)})
+    return signals(GROUPS, robot_frames, looks, {"head_left": ((640, 480), K), "head_right": ((640, 480), K)})
 
 
 @pytest.fixture(scope="module")
@@ -231,8 +231,8 @@ def test_ports_have_the_rows_names_and_types():
 
 def test_joints_gather_vectors_by_name(monkeypatch):
     ports = {"q": ("a.position", "b.position"), "v": ("b.velocity",), "tau": ("a.effort", "c.effort")}
-    monkeypatch.setitem(JOINED, "some", ports)
-    row = joints("/j", "some")
+    monkeypatch.setitem(JOINED, "some", lambda groups: ports)
+    row = joints("/j", "some", GROUPS)
     assert dict(row.inputs) == {"some": 5}
     states = parsed(row.encode(1.5, np.array([1.0, 2, 3, 4, 5])))
     assert states.timestamp.seconds == 1 and states.timestamp.nanos == 500_000_000
@@ -273,7 +273,7 @@ def test_stations_vectors_come_back_to_the_bit(log):
     _, _, message = next(log.messages(["/left_wrist/wrench"]))
     assert same(message, Wrench(0.0, np.array([1.0, 2, 3]), np.array([4.0, 5, 6])))
     states = {joint.name: joint for joint in next(log.messages(["/joint_states"]))[2].joints}
-    for k, name in enumerate(name for names in MEASURED.values() for name in names):
+    for k, name in enumerate(name for names in measured(GROUPS).values() for name in names):
         joint, quantity = name.split(".")
         assert getattr(states[joint], quantity) == k + 1
     assert log.topics["/joint_states"].count == log.topics["/joint_commands"].count == 161
@@ -309,7 +309,7 @@ def test_the_wheel_turns_with_the_marker_and_the_panel_stays():
     found = {}
     for angle in (0.0, 0.7):
         plan, turn = ms.GraspPlan(found=True, X_BV=X_BV), ms.TurnState(angle=angle)
-        tree = belief(ms.RobotState(), ms.RectangleEstimate(), plan, turn)
+        tree = belief(robot_state(), ms.RectangleEstimate(), plan, turn)
         found[angle] = {child: (parent, X) for parent, child, X in tree}
     (odometry, start), (_, end) = (found[angle]["marker"] for angle in (0.0, 0.7))
     np.testing.assert_allclose(start[:, :3].T @ end[:, :3], frames.rot_z(-0.7), atol=1e-12)
@@ -393,7 +393,7 @@ def test_scene_draws_drakes_shapes_in_their_frames(tmp_path):
 
 
 def test_every_topic_and_field_of_the_layout_is_in_a_fresh_log(log):
-    text = json.dumps(layout())
+    text = json.dumps(layout(GROUPS))
     topics = set(re.findall(r'"(/[a-z_]+(?:/[a-z_]+)*)"', text))
     paths = [path for plot in PLOTS.values() for path in plot.values()] + ["/supervisor/mode.mode"]
     for path in paths:
@@ -408,5 +408,5 @@ def test_every_panel_has_its_place():
     def leaves(node):
         return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
 
-    found = layout()
+    found = layout(GROUPS)
     assert sorted(leaves(found["layout"])) == sorted(found["configById"])

@@ -26,6 +26,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
+from robot_facts import ROBOT
 
 from valve_drake import resources, scenario
 from valve_drake.camera.lens import Lens, load_head
@@ -46,7 +47,7 @@ def rig(renderer: str) -> CameraRig:
     keys = {"renderer": renderer, "supersample": 2, "noise": 0.0}
     sc = scenario.resolve(scenario.load(None, ["seed=5", *(f"simulation.camera.{k}={v}" for k, v in keys.items())]))
     head = load_head(resources.find(sc.head_calibration, resources.models()))
-    mounts, simulation = make_mounts(head, sc.simulation, 5), sc.simulation
+    mounts, simulation = make_mounts(head, sc.simulation, 5, ROBOT.description.cameras), sc.simulation
     return CameraRig(mounts, simulation.valve, tuple(sc.marker.size), simulation.light, simulation.camera, 5)
 
 

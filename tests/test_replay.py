@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from log_samples import write_log
 from pydrake.systems.analysis import Simulator
+from robot_facts import GROUPS
 
 from valve_drake import cli, player, resources, runner
 from valve_drake import diagram as wires
@@ -23,7 +24,7 @@ from valve_drake.recording import foxglove
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recovery import recover
 from valve_drake.recording.schemas import Encoded, serialized
-from valve_drake.recording.signals import MEASURED
+from valve_drake.recording.signals import measured
 from valve_drake.recording.writer import LogWriter
 from valve_drake.stations import contract
 from valve_drake.stations.replay import Recording, make_replay_station
@@ -58,7 +59,7 @@ def log(path):
 
 @pytest.fixture(scope="module")
 def recording(log):
-    return Recording(log)
+    return Recording(log, GROUPS)
 
 
 def rewritten(log, path, topics=lambda topic: True, end=0.1, files=True, also=(), **facts):
@@ -93,7 +94,7 @@ def station_of(name, recording):
 @pytest.mark.parametrize("name", ["simulated", "replay"])
 def test_every_station_keeps_the_contract_and_the_wiring_is_the_same(name, recording):
     system = station_of(name, recording)
-    contract.check_contract(system.station)
+    contract.check_contract(system.station, GROUPS)
     wired = {f"{source} -> {target}" for source, target in wires.WIRES}
     assert set(wires.wiring(system.diagram)) == wired
     extra = set(contract.ports_of(system.station)) - {spec.name for spec in contract.CONTRACT}
@@ -116,7 +117,7 @@ def read(recording):
 def test_vectors_are_shown_from_the_tick_at_which_robot_state_read_them(log, read):
     for _, when, states in itertools.islice(log.messages(["/joint_states"]), 100, 103):
         joints = {joint.name: joint for joint in states.joints}
-        for port, names in MEASURED.items():
+        for port, names in measured(GROUPS).items():
             values = [getattr(joints[name.split(".")[0]], name.split(".")[1]) for name in names]
             for slot in range(4):
                 assert read(port, when + slot * SLOT).tolist() == values

@@ -10,12 +10,14 @@ from robot_variants import part, put, seven_joints, variant, with_roll
 
 from valve_drake import cli, yaml_file
 from valve_drake.checks import ConfigError
-from valve_drake.diagram import make_blocks
+from valve_drake.diagram import make_blocks, make_diagram
 from valve_drake.frames import compose, make, planar, rot_z
 from valve_drake.messages import LEFT, RIGHT, SIDES
+from valve_drake.recording.signals import commanded
 from valve_drake.robot import description, model
 from valve_drake.robot.robot import Robot
-from valve_drake.scenario import load
+from valve_drake.scenario import load, resolve
+from valve_drake.stations.contract import check_contract, vectors
 
 OURS = description.find(description.OURS)
 
@@ -325,7 +327,6 @@ USELESS = {
         "arms.left.home and arms.right.home must be free of all: robot::",
     ),
     "no servo": ([at("servo", "none")], [], "servo must be camera"),
-    "no waist": ([lambda given: given["gaze"].pop("waist")], [], "gaze.waist must be given"),
     "hands too small for the valve": ([at("opening", 0.03)], [], "opening must be at least 0.035: marker.handle_width"),
     "a selector that shuts the hands": ([], ["command_selector.gripper_high=0.08"], "opening must be at most command_"),
 }
@@ -340,10 +341,12 @@ def test_a_robot_that_the_program_cannot_use_is_refused_in_one_line(tmp_path, ca
     assert words in str(error.value) and str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
 
-def test_seven_joints_are_a_robot_but_not_yet_one_that_runs(tmp_path):
-    path = variant(tmp_path, seven_joints, with_roll)
-    with pytest.raises(ConfigError, match=r"arms.left.joints must be 6 joints \(no other arm is supported yet\)"):
-        make_blocks(load(None, [f"robot={path}"]))
+def test_sizes_and_names_of_the_whole_program_follow_the_robot(tmp_path):
+    robot = Robot.load(variant(tmp_path, seven_joints, with_roll))
+    assert vectors(robot.groups)["left_arm.position_command"] == 7
+    assert "left_arm_roll.position" in commanded(robot.groups)["left_arm.position_command"]
+    system = make_diagram(resolve(load(None, [f"robot={tmp_path / 'robot.yaml'}"])))
+    check_contract(system.station, robot.groups)
 
 
 def test_a_run_with_a_wrong_robot_ends_at_once_and_leaves_nothing(tmp_path, capsys):

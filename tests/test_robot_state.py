@@ -3,31 +3,34 @@
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
+from robot_facts import GROUPS
 
 from valve_drake.messages import POSE_HISTORY, SIDES
 from valve_drake.ports import SLOT, TICK
 from valve_drake.robot_state_system import HISTORY, RobotStateSystem
-from valve_drake.stations.contract import CONTRACT
+from valve_drake.stations.contract import vectors
+
+MEASURED = vectors(GROUPS, "out")
 
 
 def values() -> dict[str, np.ndarray]:
     """Station outputs in which every number differs from every other."""
     out, start = {}, 0.0
-    for name, size in RobotStateSystem.INPUTS.items():
+    for name, size in MEASURED.items():
         out[name] = start + np.arange(size)
         start += size
     return out
 
 
 def rig(**changes) -> Rig:
-    dut = Rig(RobotStateSystem())
+    dut = Rig(RobotStateSystem(GROUPS))
     dut.fix(**values() | changes)
     return dut
 
 
 def test_ports_are_the_measurements_of_the_station_contract():
-    measured = {s.name: f"in {s.kind}" for s in CONTRACT if s.direction == "out" and isinstance(s.kind, int)}
-    found = ports(RobotStateSystem())
+    measured = {name: f"in {size}" for name, size in MEASURED.items()}
+    found = ports(RobotStateSystem(GROUPS))
     assert found.pop("robot_state") == "out abstract"
     assert found == measured
 
@@ -70,9 +73,9 @@ def test_clones_are_independent():
     assert_clones_are_independent(rig, {"left_arm.position_measured": np.ones(6)}, ("robot_state",))
 
 
-@pytest.mark.parametrize("port", RobotStateSystem.INPUTS)
+@pytest.mark.parametrize("port", MEASURED)
 def test_a_missing_measurement_is_an_error(port):
-    dut = Rig(RobotStateSystem())
+    dut = Rig(RobotStateSystem(GROUPS))
     dut.fix(**{name: value for name, value in values().items() if name != port})
     with pytest.raises(RuntimeError, match=f"{port}.*nothing is connected"):
         dut.run(TICK)

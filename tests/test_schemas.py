@@ -30,7 +30,8 @@ def random_value(field: dc.Field, hint: object, rng: np.random.Generator) -> obj
     if "shape" in field.metadata:
         if field.metadata["optional"] and rng.random() < 0.5:
             return None
-        shape = [int(rng.integers(0, 9)) if n < 0 else n for n in field.metadata["shape"]]
+        least = 1 if field.metadata["optional"] else 0  # a group of no joints is commanded nothing
+        shape = [int(rng.integers(least, 9)) if n < 0 else n for n in field.metadata["shape"]]
         return np.where(rng.random(shape) < 0.2, rng.choice(STRANGE, shape), rng.normal(size=shape))
     if typing.get_origin(hint) is tuple:
         inner = typing.get_args(hint)[0]
@@ -48,7 +49,9 @@ def random_value(field: dc.Field, hint: object, rng: np.random.Generator) -> obj
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_every_message_comes_back_to_the_bit(kind):
     rng = np.random.default_rng(11)
+    left_out = [name for name in schemas.UNLOGGED.get(kind, ()) if name not in ("image", "data")]
     for message in [kind(), *(random_message(kind, rng) for _ in range(30))]:
+        message = dc.replace(message, **{name: getattr(kind(), name) for name in left_out})
         data = schemas.encode(message)
         back = schemas.decode(kind, data)
         assert same(message, back)
@@ -70,8 +73,8 @@ def test_none_and_zeros_are_told_apart():
 
 
 def test_empty_rows_keep_their_width():
-    back = schemas.decode(ms.RobotState, schemas.encode(ms.RobotState()))
-    assert back.history.shape == (0, 7)
+    back = schemas.decode(ms.QuadEdges, schemas.encode(ms.QuadEdges()))
+    assert back.points.shape == (0, 2)
 
 
 def test_matrices_are_row_major():
@@ -115,7 +118,7 @@ def test_a_type_without_protobuf_is_refused_by_name():
 def test_an_array_that_could_not_come_back_is_refused():
     @dc.dataclass(frozen=True, eq=False)
     class Doubtful(ms.Message):
-        rows: np.ndarray | None = ms.array(-1, optional=True)
+        rows: np.ndarray = ms.array(-1, -1)
 
     with pytest.raises(TypeError, match="Doubtful.rows"):
         schemas.encode(Doubtful())

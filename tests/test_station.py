@@ -5,7 +5,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
-from robot_facts import ROBOT
+from robot_facts import GROUPS, ROBOT
 
 from valve_drake import scenario as scenarios
 from valve_drake.camera.lens import Lens, OpenCvLens
@@ -13,7 +13,7 @@ from valve_drake.diagram import initial_commands, make_station
 from valve_drake.frames import apply, compose, inverse, make, planar
 from valve_drake.messages import SIDES
 from valve_drake.stations import camera_rig, contract, simulated
-from valve_drake.stations.scene import arm_joints, panel_pose, start_pose
+from valve_drake.stations.scene import panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, StartConfig, ValveConfig
 
 PERFECT = [
@@ -71,7 +71,7 @@ def rig():
 
 
 def test_the_simulated_station_exports_exactly_the_contract(rig):
-    contract.check_contract(rig.station)
+    contract.check_contract(rig.station, GROUPS)
     extra = set(contract.ports_of(rig.station)) - {spec.name for spec in contract.CONTRACT}
     assert extra == {f"truth.{name}" for name in simulated.TruthSystem.OUTPUTS}
 
@@ -85,7 +85,7 @@ def test_check_contract_names_what_is_missing_extra_and_different():
     diagram = builder.Build()
     diagram.set_name("wrong")
     with pytest.raises(TypeError) as caught:
-        contract.check_contract(diagram)
+        contract.check_contract(diagram, GROUPS)
     for words in ("missing health", "extra base.mood", "base.odometry is ('out', 4), not ('out', 5)"):
         assert words in str(caught.value)
 
@@ -119,7 +119,7 @@ def true_arm(rig, side):
     """Joint angles of an arm in the plant, as no controller knows them."""
     physics = rig.station.GetSubsystemByName("plant")
     inner = physics.plant_context(rig.context)
-    return np.array([physics.plant.GetJointByName(name).get_angle(inner) for name in arm_joints(side)])
+    return np.array([physics.plant.GetJointByName(name).get_angle(inner) for name in GROUPS.names(f"{side}_arm")])
 
 
 def test_joints_bear_their_weight_without_a_sag(rig):
@@ -138,7 +138,7 @@ def test_joints_bear_their_weight_without_a_sag(rig):
 
 def test_an_arm_with_a_wrong_zero_goes_to_where_its_encoders_read_the_command():
     error = ErrorConfig(arm_offset=0.004)
-    offsets = simulated.arm_offsets(error, seed=3)
+    offsets = simulated.arm_offsets(error, 3, ROBOT)
     all_of_them = np.concatenate(list(offsets.values()))
     assert len(set(np.abs(all_of_them))) == 12 and 0.002 < all_of_them.std() < 0.007
     rig = Rig(["simulation.error.arm_offset=0.004", "seed=3"])
@@ -273,7 +273,7 @@ def test_true_head_is_the_calibration_when_there_are_no_errors():
 
     head = load_head(models() / "calibration" / "head.yaml")
     zero = ErrorConfig(**{name: 0.0 for name in vars(ErrorConfig())})
-    mounts = simulated.true_head(head, zero, 1)
+    mounts = simulated.true_head(head, zero, 1, "eye")
     np.testing.assert_array_equal(mounts["head_left"].X_FC, make(np.eye(3), np.zeros(3)))
     np.testing.assert_allclose(mounts["head_right"].X_FC, head.X_LR)
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from robot_facts import GROUPS
 
 from valve_drake.messages import RobotState
 from valve_drake.recording import schemas, signals, tables
@@ -10,8 +11,8 @@ from valve_drake.recording.foxglove import transforms
 from valve_drake.recording.schemas import proto_class
 from valve_drake.recording.tables import table
 
-JOINTS = signals.joints("/joint_states", "measured")
-NAMES = [name for names in signals.MEASURED.values() for name in names]
+JOINTS = signals.joints("/joint_states", "measured", GROUPS)
+NAMES = [name for names in signals.measured(GROUPS).values() for name in names]
 
 
 def filled(count):

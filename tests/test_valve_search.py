@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
-from robot_facts import ROBOT
+from robot_facts import ROBOT, robot_state
 
 from valve_drake.behaviors.valve_search import Memory, ValveSearchConfig, aim, step
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
@@ -169,7 +169,7 @@ def test_search_full_of_scattered_sightings_never_succeeds():
 
 
 def test_search_looks_aside_for_a_second_then_moves_on_deaf_then_listens_again():
-    robot, mode, memory = RobotState(history=np.zeros((1, 7))), ModeState(mode="search", activation=1), Memory()
+    robot, mode, memory = robot_state(), ModeState(mode="search", activation=1), Memory()
     gaze, position, shown = [], StereoPosition(), (0.5, 1.75, 2.5)  # one sighting at each of these times
     for k in range(int(3 / DT)):
         if k % 8 == 0 and memory.torso is not None:
@@ -193,7 +193,7 @@ def test_search_looks_aside_for_a_second_then_moves_on_deaf_then_listens_again()
 
 def test_search_ignores_images_from_before_it_began():
     old = StereoPosition(time=9.0, found=True, p_LV=np.array([0, 0, 3.0]), covariance=np.eye(3) * 1e-6)
-    robot = RobotState(time=10.0, history=np.zeros((1, 7)))
+    robot = robot_state(time=10.0)
     memory, mode = Memory(), ModeState(mode="search", activation=1)
     for k in range(20):
         old = dc.replace(old, time=9.0 + 0.01 * k)
@@ -295,7 +295,7 @@ def test_gaze_keeps_the_marker_centred_while_the_base_turns_and_drives():
 
 def test_gaze_takes_the_fresher_of_both_stages():
     memory = Memory()
-    robot = RobotState(history=np.zeros((1, 7)))
+    robot = robot_state()
     near, far = np.array([0.0, 0.0, 2.0]), np.array([0.1, 0.0, 2.0])
     for newer in ("position", "estimate"):
         times = {"position": 1.0, "estimate": 1.0} | {newer: 1.1}
@@ -306,7 +306,7 @@ def test_gaze_takes_the_fresher_of_both_stages():
 
 
 def test_gaze_does_not_follow_a_single_false_sighting_but_a_marker_that_moved():
-    robot = RobotState(history=np.zeros((1, 7)))
+    robot = robot_state()
     memory = Memory()
 
     def see(t, p):
@@ -364,15 +364,15 @@ def test_a_marker_that_is_seen_is_not_lost():
 
 
 def rig(**inputs) -> Rig:
-    robot = RobotState(time=0.0, history=np.zeros((1, 7)))
+    robot = robot_state(time=0.0)
     return Rig(
-        ValveSearchSystem(CONFIG, HEAD),
+        ValveSearchSystem(CONFIG, HEAD, np.zeros(3), 0),
         **{"robot_state": robot, "mode": ModeState(mode="search", activation=1)} | inputs,
     )
 
 
 def test_ports():
-    assert ports(ValveSearchSystem(CONFIG, HEAD)) == {
+    assert ports(ValveSearchSystem(CONFIG, HEAD, np.zeros(3), 0)) == {
         "robot_state": "in abstract",
         "mode": "in abstract",
         "position": "in abstract",
@@ -402,7 +402,7 @@ def test_block_refuses_a_wrong_message_and_needs_the_mode():
     with pytest.raises(TypeError, match="want StereoPosition"):
         rig(position=RectangleEstimate()).run(0.1)
     with pytest.raises(RuntimeError, match="mode.*valve_search.*nothing is connected"):
-        Rig(ValveSearchSystem(CONFIG, HEAD), robot_state=RobotState(history=np.zeros((1, 7)))).run(0.1)
+        Rig(ValveSearchSystem(CONFIG, HEAD, np.zeros(3), 0), robot_state=robot_state()).run(0.1)
 
 
 @pytest.mark.parametrize(
@@ -418,4 +418,4 @@ def test_block_refuses_a_wrong_message_and_needs_the_mode():
 )
 def test_bad_config_is_refused_by_name(changes, words):
     with pytest.raises(ConfigError, match=words):
-        ValveSearchSystem(ValveSearchConfig(**changes), HEAD)
+        ValveSearchSystem(ValveSearchConfig(**changes), HEAD, np.zeros(3), 0)

@@ -23,12 +23,13 @@ from valve_drake.behaviors.image_servo_system import ImageServoSystem
 from valve_drake.behaviors.kinematic_approach import KinematicApproach
 from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
 from valve_drake.behaviors.taught import load_taught
+from valve_drake.behaviors.valve_search import ValveSearchConfig
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError, require
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, make
-from valve_drake.messages import SIDES, OperatorCommand, RobotState
+from valve_drake.messages import SIDES, OperatorCommand
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
 from valve_drake.perception.handle_marker_system import HandleMarkerSystem
 from valve_drake.perception.line_fitting_system import LineFittingSystem
@@ -38,18 +39,21 @@ from valve_drake.ports import Block
 from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.recording.signals import JOINED
 from valve_drake.robot import description as descriptions
+from valve_drake.robot.groups import Groups
 from valve_drake.robot.robot import Robot
 from valve_drake.robot_state_system import RobotStateSystem
 from valve_drake.scenario import Scenario
 from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
-from valve_drake.stations.contract import CONTRACT
+from valve_drake.stations.contract import CONTRACT, vectors
 from valve_drake.stations.hardware import RobotLink, make_hardware_station
 from valve_drake.stations.replay import Recording, make_replay_station
 from valve_drake.stations.simulated import make_simulated_station, rig_arguments
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
 from valve_drake.supervisor.supervisor_system import SupervisorSystem
 from valve_drake.task.modes import BEHAVIORS
+
+MEASURED = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and not isinstance(spec.kind, type))
 
 WIRES: tuple[tuple[str, str], ...] = (
     # head cameras: stages 1 and 2
@@ -62,7 +66,7 @@ WIRES: tuple[tuple[str, str], ...] = (
     ("station.left_wrist.image", "handle_marker.left_wrist_image"),
     ("station.right_wrist.image", "handle_marker.right_wrist_image"),
     # joints and forces
-    *((f"station.{name}", f"robot_state.{name}") for name in RobotStateSystem.INPUTS),
+    *((f"station.{name}", f"robot_state.{name}") for name in MEASURED),
     *(
         ("robot_state.robot_state", f"{block}.robot_state")
         for block in ("stereo_positioning", "rectangle_estimator", *BEHAVIORS, "command_selector")
@@ -108,15 +112,12 @@ class System:
 def robot_of(scenario: Scenario) -> Robot:
     """The robot of a scenario. Raises ConfigError if there is none, or the program cannot use it."""
     robot = Robot.load(descriptions.find(scenario.robot))
-    d, sizes = robot.description, RobotState()
+    d = robot.description
     try:
-        for side in SIDES:
-            count, arm = len(getattr(sizes, f"{side}_arm")), d.arm(side).joints
-            require(len(arm) == count, f"arms.{side}.joints", f"{count} joints (no other arm is supported yet)", arm)
         require(not d.lift.joints, "lift.joints", "none (a lift is not supported yet)", d.lift.joints)
-        require(bool(d.gaze.waist), "gaze.waist", "given (a robot without one is not supported yet)", d.gaze.waist)
         require(d.servo == "camera", "servo", "camera (another way is not supported yet)", d.servo)
         require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
+        _check_gaze(scenario.valve_search, robot)
         high, width = scenario.command_selector.gripper_high, scenario.marker.handle_width
         require(d.opening <= high, "opening", f"at most command_selector.gripper_high, {high:g}", d.opening)
         least = width + 2 * scenario.hybrid_rotation.grip_margin
@@ -126,11 +127,30 @@ def robot_of(scenario: Scenario) -> Robot:
     return robot
 
 
+def _check_gaze(search: ValveSearchConfig, robot: Robot) -> None:
+    """The gaze is planned within what the robot's joints can do. Raises ConfigError."""
+    limits = dict(zip(robot.torso.names, zip(robot.torso.low.tolist(), robot.torso.high.tolist())))
+    waist, tilt, pan = robot.waist, robot.torso.names[-2], robot.torso.names[-1]
+
+    def symmetric(joint: str) -> tuple[float, float]:
+        low, high = limits[joint]
+        return 0.0, min(-low, high)
+
+    asked = [("pitch_low", limits[tilt]), ("pitch_high", limits[tilt]), ("yaw_limit", symmetric(pan))]
+    if waist is not None:
+        asked.append(("sweep_waist", symmetric(robot.torso.names[waist])))
+    for name, (low, high) in asked:
+        value = getattr(search, name)
+        words = f"within what the robot's joint can do, [{low:g}, {high:g}]"
+        require(low <= value <= high, f"valve_search.{name}", words, value)
+
+
 def initial_commands(scenario: Scenario) -> dict[str, np.ndarray]:
     """The values of the station's inputs before the first command, by port."""
     robot = robot_of(scenario)
     arms = robot.split(robot.home)
-    out = {spec.name: np.zeros(spec.kind) for spec in CONTRACT if isinstance(spec.kind, int) and spec.direction == "in"}
+    out = {name: np.zeros(size) for name, size in vectors(robot.groups, "in").items()}
+    out["torso.position_command"] = robot.torso.home
     for side in SIDES:
         out[f"{side}_arm.position_command"] = arms[side]
         out[f"{side}_gripper.position_command"] = np.array([robot.opening])
@@ -147,7 +167,9 @@ def make_station(
 ) -> Diagram:
     """The station of a resolved scenario. recording: for station `replay`; link: for station `hardware`."""
     if scenario.station == "hardware":
-        return make_hardware_station(RobotLink(Bus(scenario.hardware)) if link is None else link)
+        return make_hardware_station(
+            RobotLink(Bus(scenario.hardware), robot_of(scenario).groups) if link is None else link
+        )
     if scenario.station == "replay":
         if recording is None:
             raise ConfigError("station replay needs a log: valve-drake replay LOG")
@@ -157,12 +179,10 @@ def make_station(
         scenario.simulation,
         (scenario.marker.size[0], scenario.marker.size[1]),
         _head(scenario),
-        robot.home,
-        robot.opening,
+        robot,
         scenario.seed,
         meshcat,
         workers,
-        robot.description,
     )
 
 
@@ -190,18 +210,23 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
         raise ConfigError(f"{scenario.robot}: arms.left.home and arms.right.home must be free of all: {touching[0]}")
     stances = Stances(robot, marker, scenario.stance, view, collision.is_free)
     return [
-        RobotStateSystem(),
+        RobotStateSystem(robot.groups),
         ColorSegmentationSystem(scenario.color_segmentation),
         LineFittingSystem(scenario.line_fitting, head, marker, scenario.stereo_positioning),
         StereoPositioningSystem(scenario.stereo_positioning, head, robot.head_pose, marker),
         RectangleEstimatorSystem(scenario.rectangle_estimator, head, robot.head_pose, marker),
         HandleMarkerSystem(scenario.handle_marker),
-        ValveSearchSystem(scenario.valve_search, lambda base, torso: compose(robot.head_pose(base, torso), X_LEyes)),
+        ValveSearchSystem(
+            scenario.valve_search,
+            lambda base, torso: compose(robot.head_pose(base, torso), X_LEyes),
+            robot.torso.home,
+            robot.waist,
+        ),
         BaseApproachSystem(scenario.base_approach, marker),
         KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, stances, area)),
         ImageServoSystem(ImageServo(scenario.image_servo, robot, taught)),
         HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, marker, robot, view)),
-        CommandSelectorSystem(scenario.command_selector, initial_commands(scenario), robot.arms),
+        CommandSelectorSystem(scenario.command_selector, initial_commands(scenario), robot.torso, robot.arms),
         SupervisorSystem(scenario.supervisor),
     ]
 
@@ -234,7 +259,7 @@ def make_diagram(
     builder.ExportInput(systems["supervisor"].GetInputPort("operator"), OPERATOR)
     if recorder is not None:
         builder.AddSystem(recorder)
-        _connect_recorder(builder, recorder, systems, truth)
+        _connect_recorder(builder, recorder, systems, robot_of(scenario).groups, truth)
     diagram = builder.Build()
     diagram.set_name("valve_drake")
     return System(diagram, station, systems["supervisor"])
@@ -252,14 +277,16 @@ def recorded_from(name: str) -> str:
 _OWNER = {"out": "station.", "in": "command_selector."}  # of the contract's ports
 
 
-def _connect_recorder(builder: DiagramBuilder, recorder: RecorderSystem, systems: dict[str, Any], truth: bool) -> None:
+def _connect_recorder(
+    builder: DiagramBuilder, recorder: RecorderSystem, systems: dict[str, Any], groups: Groups, truth: bool
+) -> None:
     """Every port of the recorder is named after what it records: a station's port, a command, block.port, or JOINED."""
     station = systems["station"]
     exported = {station.get_output_port(k).get_name() for k in range(station.num_output_ports())}
 
     def connect(name: str, port: InputPort) -> None:
         if name in JOINED:
-            parts = JOINED[name]
+            parts = JOINED[name](groups)
             join = builder.AddNamedSystem(name, Multiplexer([len(values) for values in parts.values()]))
             for k, part in enumerate(parts):
                 connect(part, join.get_input_port(k))

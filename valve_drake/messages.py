@@ -125,20 +125,20 @@ class RobotState(Message):
 
     time: float = 0.0
     odometry: np.ndarray = array(5)  # x, y [m], heading [rad], forward [m/s], yaw rate [rad/s]
-    torso: np.ndarray = array(3)  # waist twist, neck pitch, neck yaw [rad]
-    left_arm: np.ndarray = array(6)  # [rad]
-    right_arm: np.ndarray = array(6)
-    left_arm_velocity: np.ndarray = array(6)  # [rad/s]
-    right_arm_velocity: np.ndarray = array(6)
-    left_arm_torque: np.ndarray = array(6)  # [N m]
-    right_arm_torque: np.ndarray = array(6)
+    torso: np.ndarray = array(-1)  # lift and waist, if there are; tilt, pan [m, rad]
+    left_arm: np.ndarray = array(-1)  # [rad]
+    right_arm: np.ndarray = array(-1)
+    left_arm_velocity: np.ndarray = array(-1)  # [rad/s]
+    right_arm_velocity: np.ndarray = array(-1)
+    left_arm_torque: np.ndarray = array(-1)  # [N m]
+    right_arm_torque: np.ndarray = array(-1)
     left_gripper: float = 0.0  # opening between the pads [m]
     right_gripper: float = 0.0
     left_gripper_force: float = 0.0  # on the pads [N]
     right_gripper_force: float = 0.0
     left_wrench: np.ndarray = array(6)  # [torque; force] felt by the sensor, in its frame, raw
     right_wrench: np.ndarray = array(6)
-    history: np.ndarray = array(-1, 7)  # rows, oldest first: t, x, y, heading, waist, neck pitch, neck yaw
+    history: np.ndarray = array(-1, -1)  # rows, oldest first: t, x, y, heading, torso
 
     def head_at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Base (x, y, heading) and torso angles at `time`, interpolated -> (3,), (3,)."""
@@ -369,9 +369,9 @@ class Command(Message):
 
     time: float = 0.0
     base_twist: np.ndarray | None = array(2, optional=True)  # forward [m/s], yaw rate [rad/s]
-    torso: np.ndarray | None = array(3, optional=True)  # [rad]
-    left_arm: np.ndarray | None = array(6, optional=True)  # [rad]
-    right_arm: np.ndarray | None = array(6, optional=True)
+    torso: np.ndarray | None = array(-1, optional=True)  # [m, rad]
+    left_arm: np.ndarray | None = array(-1, optional=True)  # [rad]
+    right_arm: np.ndarray | None = array(-1, optional=True)
     left_gripper: np.ndarray | None = array(2, optional=True)  # opening [m], force limit [N]
     right_gripper: np.ndarray | None = array(2, optional=True)
 

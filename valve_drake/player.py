@@ -45,7 +45,7 @@ class Player:
     """
 
     def __init__(self, scenario: Scenario, recording: Recording, recorder: RecorderSystem):
-        self._recorder = recorder
+        self._recorder, self._groups = recorder, recording.groups
         self._slot = 0  # the next one whose updates are due
         self._values: dict[str, Any] = {"supervisor.operator": OperatorCommand()}  # what ports hold, by block.port
         self._station, self._joined = shown(recording), recording.joined
@@ -123,7 +123,7 @@ class Player:
         if name in self._joined:
             return self._joined[name].at
         if name in JOINED:
-            parts = [self._read(recorded_from(part)) for part in JOINED[name]]
+            parts = [self._read(recorded_from(part)) for part in JOINED[name](self._groups)]
             return lambda time: np.concatenate([part(time) for part in parts])
         source = recorded_from(name)
         if source == OPERATOR:

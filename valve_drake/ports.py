@@ -155,7 +155,7 @@ class Block(PythonSystem, Generic[In, M]):
     first, and then its outputs hold: nobody listens, and nothing is logged.
     """
 
-    INPUTS: ClassVar[Mapping[str, Kind]] = {}
+    INPUTS: Mapping[str, Kind] = {}
     OUTPUTS: Mapping[str, Kind] = {}
     AWAKE: ClassVar[frozenset[str] | None] = None  # the modes in which it steps; None: in all
     _inputs: ClassVar[type[Inputs]] = Inputs

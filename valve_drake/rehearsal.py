@@ -10,8 +10,10 @@ from typing import Any
 import cv2
 from pydrake.lcm import DrakeLcm
 
+from valve_drake.checks import require
 from valve_drake.console import complain
-from valve_drake.diagram import initial_commands, make_station, rig_of
+from valve_drake.diagram import initial_commands, make_station, rig_of, robot_of
+from valve_drake.messages import SIDES
 from valve_drake.pace import Pace, Pacer
 from valve_drake.ports import SLOT
 from valve_drake.processor import goes_first
@@ -60,10 +62,16 @@ def make_twin(
     lcm: DrakeLcm | None = None,
 ) -> Twin:
     """The twin of a resolved scenario. workers: make its images; LiveImages, and their rate, to keep real time."""
+    robot = robot_of(scenario)
+    for k, fault in enumerate(scenario.faults):
+        if fault.kind == "stuck":
+            last = robot.groups.size(fault.device) - 1
+            require(fault.joint <= last, f"faults[{k}].joint", f"within [0, {last}]", fault.joint)
     station = make_station(dc.replace(scenario, station="simulated"), workers=workers)
     return Twin(
         station,
         initial_commands(scenario),
+        {"torso": robot.torso.speed, **{f"{side}_arm": robot.arms[side].speed for side in SIDES}},
         scenario.hardware,
         scenario.simulation.camera,
         Faults(scenario.faults, scenario.seed),
@@ -81,7 +89,7 @@ def beside(scenario: Scenario) -> Iterator[tuple[RobotLink, Twin]]:
     hardware = dc.replace(scenario.hardware, lockstep=True)
     with CameraWorkers(*rig_of(scenario)) as workers:
         twin = make_twin(dc.replace(scenario, hardware=hardware), workers=workers, lcm=lcm)
-        yield RobotLink(Bus(hardware, lcm), idle=twin.poll), twin
+        yield RobotLink(Bus(hardware, lcm), robot_of(scenario).groups, idle=twin.poll), twin
 
 
 def run_twin(

@@ -127,8 +127,9 @@ class Result:
 def make_recorder(sink: Sink, scenario: Scenario) -> RecorderSystem:
     """The recorder with all topics of the program."""
     head = load_head(resources.find(scenario.head_calibration, resources.models()))
-    frames = RobotFrames(robot_of(scenario), head, scenario.marker)
-    return RecorderSystem(sink, signals(frames, frames.scene, pinholes(head)))
+    robot = robot_of(scenario)
+    frames = RobotFrames(robot, head, scenario.marker)
+    return RecorderSystem(sink, signals(robot.groups, frames, frames.scene, pinholes(head)))
 
 
 def run(
@@ -168,7 +169,7 @@ def run(
         profile = stack.enter_context(profiling.measure())
         workers = None
         if scenario.station == "hardware":
-            link = link or RobotLink(Bus(scenario.hardware), stop=stop)
+            link = link or RobotLink(Bus(scenario.hardware), robot_of(scenario).groups, stop=stop)
         else:
             workers = stack.enter_context(
                 CameraWorkers(*rig_of(scenario))
@@ -293,7 +294,9 @@ def _begin_log(writer: LogWriter, scenario: Scenario, files: Mapping[str, bytes]
     """What every log begins with; `files`: what the scenario names, to attach."""
     about = {"scenario": dump(scenario), "seed": str(scenario.seed), "station": scenario.station}
     writer.write_metadata("run", about | versions() | facts)
-    writer.attach(layout.NAME, layout.MEDIA_TYPE, json.dumps(layout.layout(), indent=1).encode())
+    writer.attach(
+        layout.NAME, layout.MEDIA_TYPE, json.dumps(layout.layout(robot_of(scenario).groups), indent=1).encode()
+    )
     for name, data in files.items():
         writer.attach(name, "application/yaml", data)
 
@@ -450,12 +453,12 @@ def replay(
         if key.partition(".")[0] in RECORDED:
             raise ConfigError(f"--set {key}: it is recorded; a replay can change the blocks' keys only")
     scenario = with_overrides(dc.replace(recorded, station="replay"), overrides)
-    recording = Recording(log)
     cv2.setNumThreads(1)  # as in the run
-    comparison = Comparison(log, recording.end)
     with contextlib.ExitStack() as stack:
         files = stack.enter_context(_files_of(log, scenario, changed))
         data = _read_files(files)
+        recording = Recording(log, robot_of(files).groups)
+        comparison = Comparison(log, recording.end)
         sink: Sink = comparison
         writer = None
         if copy is not None:

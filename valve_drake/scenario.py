@@ -41,7 +41,11 @@ RETIRED = (
     "base_approach.arms_still",
     "base_approach.arms_wait",
     "base_approach.arms_patience",
-    "command_selector.arm_limit",
+    *(
+        f"command_selector.{name}"
+        for name in ("arm_limit", "arm_speed", "arm_acceleration", "torso_low", "torso_high", "torso_speed")
+    ),
+    "command_selector.torso_acceleration",
     "color_segmentation.every",
     "handle_marker.every",
     "handle_marker.lines.single_camera",
@@ -104,17 +108,6 @@ class Scenario(Config):
             block, _, force = name.partition(".")
             most, value = selector.gripper_force, getattr(getattr(self, block), force)
             require(value <= most, name, f"at most command_selector.gripper_force, {most:g}", value)
-        # The gaze is planned within what the selector lets through.
-        search = self.valve_search
-        waist, pitch, yaw = zip(selector.torso_low, selector.torso_high)
-        for name, value, (low, high) in (
-            ("sweep_waist", search.sweep_waist, (0.0, min(-waist[0], waist[1]))),
-            ("pitch_low", search.pitch_low, pitch),
-            ("pitch_high", search.pitch_high, pitch),
-            ("yaw_limit", search.yaw_limit, (0.0, min(-yaw[0], yaw[1]))),
-        ):
-            words = f"within command_selector's torso limits, [{low:g}, {high:g}]"
-            require(low <= value <= high, f"valve_search.{name}", words, value)
 
 
 def former_names() -> dict[str, str]:

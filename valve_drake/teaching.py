@@ -19,9 +19,10 @@ from valve_drake.diagram import robot_of
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import SIDES
 from valve_drake.perception.handle_marker import find_mark
+from valve_drake.robot.robot import Robot
 from valve_drake.scenario import Scenario, resolve
 from valve_drake.stations.camera_rig import CameraRig, Capture
-from valve_drake.stations.scene import BASE, arm_joints, panel_pose, start_pose
+from valve_drake.stations.scene import panel_pose, start_pose
 from valve_drake.stations.simulated import make_mounts
 from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
 
@@ -42,7 +43,7 @@ def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.
     marker = scenario.marker
     head = load_head(resources.find(scenario.head_calibration, resources.models()))
     robot = robot_of(scenario)
-    mounts = make_mounts(head, simulation, scenario.seed)
+    mounts = make_mounts(head, simulation, scenario.seed, robot.description.cameras)
     size = (marker.size[0], marker.size[1])
     rig = CameraRig(mounts, valve, size, simulation.light, simulation.camera, scenario.seed, robot.description)
     X_WV = compose(panel_pose(valve), make(np.eye(3), np.array([0, 0, -marker.panel_depth])))
@@ -65,7 +66,7 @@ def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.
             q = robot.inverse(side, moved, q0[side])
             if q is None:
                 raise ConfigError(f"teach: the {side} hand does not reach a probe at {offset} m")
-            positions = _positions(rig, base, q0 | {side: q}, robot.opening)
+            positions = _positions(rig, base, q0 | {side: q}, robot)
             frames = [rig.frame(f"{side}_wrist", Capture(0.0, k, positions)) for k in range(IMAGES)]
             marks = [find_mark(frame.image, scenario.handle_marker) for frame in frames]
             found = [mark for mark in marks if mark.found]
@@ -81,12 +82,9 @@ def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.
     return taught, pictures
 
 
-def _positions(rig: CameraRig, base: np.ndarray, arms: dict[str, np.ndarray], opening: float) -> np.ndarray:
+def _positions(rig: CameraRig, base: np.ndarray, arms: dict[str, np.ndarray], robot: Robot) -> np.ndarray:
     """The rig's joint positions with the robot at `base` and its arms as given."""
-    values = dict(zip(BASE, base))
-    for side, q in arms.items():
-        values |= dict(zip(arm_joints(side), q))
-        values |= {f"{side}_finger_{k}": opening / 2 for k in (1, 2)}
+    values = robot.named(base=base, torso=robot.torso.home, arms=arms, opening=robot.opening)
     positions = np.zeros(rig.plant.num_positions())
     for name, value in values.items():
         positions[rig.plant.GetJointByName(name, rig.scene.robot).position_start()] = value

@@ -9,9 +9,8 @@ import numpy as np
 
 from valve_drake.analysis import two_logs
 from valve_drake.analysis.plots import Line, Plot
-from valve_drake.analysis.traces import ARMS, Traces
+from valve_drake.analysis.traces import Traces
 from valve_drake.messages import SIDES, Mode
-from valve_drake.recording.signals import TORSO
 from valve_drake.task.modes import RUNNING, owned
 
 BLUE, ORANGE, GREEN, BLACK, GREY = "#0b62a8", "#d1500c", "#157f4c", "#1b1b1b", "#8a8f98"
@@ -194,7 +193,8 @@ def _angle_difference(log: Traces) -> Plot:
 
 
 def _tracking(log: Traces) -> Plot:
-    groups = [("torso", TORSO, GREEN)] + [(f"{side} arm", ARMS[side], SIDE_COLORS[side]) for side in SIDES]
+    colors = {"torso": GREEN} | {f"{side}_arm": SIDE_COLORS[side] for side in SIDES}
+    groups = [(group.replace("_", " "), names, colors[group]) for group, names in log.groups.items()]
     lines: list[Line] = []
     if log.joints is not None:
         for label, names, color in groups:

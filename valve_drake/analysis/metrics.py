@@ -6,10 +6,9 @@ import os
 
 import numpy as np
 
-from valve_drake.analysis.traces import ARMS, Estimates, ModeSpan, Traces
+from valve_drake.analysis.traces import Estimates, ModeSpan, Traces
 from valve_drake.messages import SIDES, Mode
 from valve_drake.recording.reader import LogReader
-from valve_drake.recording.signals import TORSO
 from valve_drake.task.modes import TERMINAL
 
 LOADED = 1.0  # below this couple the hands' shares are noise and are left out [N m]
@@ -203,7 +202,7 @@ def _joints(log: Traces, out: Summary) -> None:
     joints = log.joints
     if joints is None:
         return
-    for name in (*TORSO, *(name for arm in ARMS.values() for name in arm)):
+    for name in (name for group in log.groups.values() for name in group):
         error = joints.error((name,))
         error = np.abs(error[:, 0]) if error.shape[1] else error
         if error.size and np.isfinite(error).all():

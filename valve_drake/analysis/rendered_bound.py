@@ -18,13 +18,13 @@ from valve_drake.analysis import experiments
 from valve_drake.analysis.drawn_images import Canvas
 from valve_drake.camera.lens import StereoHead
 from valve_drake.diagram import robot_of
-from valve_drake.messages import SIDES, MarkerEdges
+from valve_drake.messages import MarkerEdges
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
 from valve_drake.scenario import Scenario
 from valve_drake.stations.camera_rig import CameraRig, Capture
 from valve_drake.stations.contract import HEAD
-from valve_drake.stations.scene import BASE, arm_joints, start_pose
+from valve_drake.stations.scene import start_pose
 from valve_drake.stations.simulated import true_head
 from valve_drake.stations.simulation_config import CameraConfig, ErrorConfig, LightConfig, StartConfig, ValveConfig
 
@@ -48,10 +48,11 @@ class _Studio:
     def __init__(self, seed: int, camera: CameraConfig):
         self.eyes: StereoHead = experiments.head()
         self.marker, self.camera, self.valve = Marker(), camera, ValveConfig()
-        mounts = true_head(self.eyes, ErrorConfig(head_yaw=0.0, head_rotation=0.0, head_mount=0.0), seed)
+        self._robot = robot_of(Scenario())
+        none = ErrorConfig(head_yaw=0.0, head_rotation=0.0, head_mount=0.0)
+        mounts = true_head(self.eyes, none, seed, self._robot.description.cameras["head_left"])
         size = (self.marker.size[0], self.marker.size[1])
         self.rig = CameraRig(mounts, self.valve, size, LightConfig(), camera, seed)
-        self._arms = dict(zip((name for side in SIDES for name in arm_joints(side)), robot_of(Scenario()).home))
         self.noise = float(self.camera.noise)  # type: ignore[arg-type]  # resolved: no distribution
 
     def place(self, rng: np.random.Generator, band: tuple[float, float]) -> _Place:
@@ -59,7 +60,10 @@ class _Studio:
         plant, scene = self.rig.plant, self.rig.scene
         while True:
             start = StartConfig(rng.uniform(band[0], band[1] + 0.6), *(rng.uniform(-a, a) for a in (BEARING, HEADING)))
-            values = self._arms | dict(zip(BASE, start_pose(start, self.valve))) | {"neck_pitch": rng.uniform(*PITCH)}
+            torso = self._robot.torso.home.copy()
+            torso[-2] += rng.uniform(*PITCH)  # tilt
+            arms = self._robot.split(self._robot.home)
+            values = self._robot.named(base=start_pose(start, self.valve), torso=torso, arms=arms)
             q = np.zeros(plant.num_positions())
             for name, value in values.items():
                 q[plant.GetJointByName(name, scene.robot).position_start()] = value

@@ -15,13 +15,12 @@ from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, inverse, make, rot_z, rotation_vector, wrap
 from valve_drake.messages import SIDES, Mode
 from valve_drake.recording.reader import LogReader, Record
-from valve_drake.recording.signals import TORSO
 from valve_drake.recording.tables import Table
+from valve_drake.robot.groups import GROUPS
 
 if TYPE_CHECKING:
     from valve_drake.robot.robot import Robot
 
-ARMS = {side: tuple(f"{side}_arm_{k}" for k in range(1, 7)) for side in SIDES}
 SCHEMAS = {  # of the topics that are read here
     "/supervisor/mode": "valve_drake.ModeState",
     "/joint_states": "foxglove.JointStates",
@@ -210,6 +209,13 @@ class Traces:
         source = f"{self.reader.path}: robot.yaml"
         return Robot.of(description.parse(kept.data.decode(), source, self.reader.path), source)
 
+    @functools.cached_property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Names of the robot's joints by group; none if the log's robot cannot be read."""
+        if self.robot is None:
+            return {}
+        return {group: self.robot.groups.names(group) for group in GROUPS}
+
     @_Trace
     def truth(self) -> Truth | None:
         topics = ("/truth/base_pose", "/truth/marker_pose", "/truth/valve_angle")
@@ -246,13 +252,12 @@ class Traces:
     def true_X_LV(self, time: np.ndarray) -> np.ndarray | None:
         """The marker in the (nominal) left head camera at these instants -> (N, 3, 4); None without truth."""
         truth, joints = self.truth, self.joints
-        if truth is None or joints is None or len(joints.index(TORSO)) < len(TORSO):
+        names = self.groups.get("torso", ())
+        if truth is None or joints is None or self.robot is None or len(joints.index(names)) < len(names):
             return None
         base = interpolate(time, truth.time, truth.base)
         marker = interpolate(time, truth.time, truth.X_WV)
-        torso = interpolate(time, joints.time, joints.position[:, joints.index(TORSO)])
-        if self.robot is None:
-            return None
+        torso = interpolate(time, joints.time, joints.position[:, joints.index(names)])
         heads = (self.robot.head_pose(b, q) for b, q in zip(base, torso))
         return np.array([compose(inverse(X_WL), X_WV) for X_WL, X_WV in zip(heads, marker)]).reshape(-1, 3, 4)
 
@@ -319,8 +324,9 @@ class Traces:
         for side in SIDES:
             out[f"{side}_error"] = np.array([np.linalg.norm(getattr(m, f"{side}_error")) for _, m in rows])
             robot = self.robot
-            if self.joints is not None and robot is not None and len(self.joints.index(ARMS[side])) == len(ARMS[side]):
-                at = self.joints.index(ARMS[side])
+            arm = self.groups.get(f"{side}_arm", ())
+            if self.joints is not None and robot is not None and len(self.joints.index(arm)) == len(arm):
+                at = self.joints.index(arm)
                 q = interpolate(out["time"], self.joints.time, self.joints.position[:, at])
                 v = interpolate(out["time"], self.joints.time, self.joints.velocity[:, at])
                 J = (robot.jacobian(side, row)[3:] for row in q)

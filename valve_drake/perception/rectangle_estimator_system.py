@@ -9,7 +9,8 @@ from valve_drake import frames
 from valve_drake.camera.lens import StereoHead
 from valve_drake.messages import MarkerEdges, ModeState, RectangleEstimate, RobotState
 from valve_drake.perception.marker import Marker
-from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
+from valve_drake.perception.rectangle_config import RectangleEstimatorConfig
+from valve_drake.perception.rectangle_estimator import Track, estimate
 from valve_drake.ports import Block, Inputs, Outputs
 
 

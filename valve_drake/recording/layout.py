@@ -7,12 +7,14 @@ a topic only when they are told to.
 from typing import Any
 
 from valve_drake.messages import SIDES
+from valve_drake.robot.groups import Groups
 
 NAME, MEDIA_TYPE = "layout.json", "application/json"  # of the attachment
 
 HEAD, WRIST = ("head_left", "head_right"), ("left_wrist", "right_wrist")
 VISIBLE_3D = ("/tf", "/scene", "/rectangle_estimator/pose", *(f"/{camera}/calibration" for camera in HEAD))
-JOINT = '/{topic}.joints[:]{{name=="{side}_arm_{k}"}}.position'
+JOINT = '/{topic}.joints[:]{{name=="{joint}"}}.position'
+TRACKED = 3  # joints of each arm that are plotted, from the shoulder on
 PLOTS: dict[str, dict[str, str]] = {  # title -> label -> message path
     "Valve angle [rad]": {
         "by the hands": "/hybrid_rotation/turn.angle",
@@ -27,12 +29,6 @@ PLOTS: dict[str, dict[str, str]] = {  # title -> label -> message path
     "Servo error [m]": {
         f"{side} {'xyz'[k]}": f"/image_servo/servo.{side}_error[{k}]" for side in SIDES for k in range(3)
     },
-    "Joint tracking [rad]": {
-        f"{side} {k} {topic.removeprefix('joint_')}": JOINT.format(topic=topic, side=side, k=k)
-        for side in SIDES
-        for k in (1, 2, 3)
-        for topic in ("joint_states", "joint_commands")
-    },
     "Distance to the marker [m]": {
         "stage 1": "/stereo_positioning/position.p_LV[2]",
         "stage 2": "/rectangle_estimator/estimate.X_LV[11]",
@@ -40,8 +36,19 @@ PLOTS: dict[str, dict[str, str]] = {  # title -> label -> message path
 }
 
 
-def layout() -> dict[str, Any]:
-    """The layout as a JSON object."""
+def _tracking(groups: Groups) -> dict[str, str]:
+    """Label -> message path of the arms' joints, measured and commanded."""
+    return {
+        f"{side} {k + 1} {topic.removeprefix('joint_')}": JOINT.format(topic=topic, joint=joint)
+        for side in SIDES
+        for k, joint in enumerate(groups.names(f"{side}_arm")[:TRACKED])
+        for topic in ("joint_states", "joint_commands")
+    }
+
+
+def layout(groups: Groups) -> dict[str, Any]:
+    """The layout for a robot as a JSON object."""
+    plots = PLOTS | {"Joint tracking [rad]": _tracking(groups)}
     world = {
         "cameraState": {"distance": 5.0, "perspective": True, "phi": 65.0, "thetaOffset": 120.0, "target": [0, 0, 0.8]},
         "layers": {"grid": {"layerId": "foxglove.Grid", "visible": True, "size": 10, "divisions": 10}},
@@ -53,17 +60,17 @@ def layout() -> dict[str, Any]:
         "StateTransitions!modes": modes,
         "RosOut!log": {"searchTerms": [], "minLogLevel": 1},
         **{f"Image!{camera}": _image(camera) for camera in (*HEAD, *WRIST)},
-        **{f"Plot!{title}": _plot(title, paths) for title, paths in PLOTS.items()},
+        **{f"Plot!{title}": _plot(title, paths) for title, paths in plots.items()},
     }
     head, wrist = ([f"Image!{camera}" for camera in cameras] for cameras in (HEAD, WRIST))
-    plots = [f"Plot!{title}" for title in PLOTS]
+    curves = [f"Plot!{title}" for title in plots]
     tree = _split(
         "row",
         _split("column", "3D!world", _even("column", [_even("row", head), _even("row", wrist)]), 50),
         _split(
             "column",
             "StateTransitions!modes",
-            _even("row", [_even("column", plots[0::2]), _even("column", [*plots[1::2], "RosOut!log"])]),
+            _even("row", [_even("column", curves[0::2]), _even("column", [*curves[1::2], "RosOut!log"])]),
             14,
         ),
         45,

@@ -38,7 +38,8 @@ class RobotFrames:
             "torso": [self._slot(n) for n in robot.torso.names],
             **{side: [self._slot(n) for n in robot.arms[side].names] for side in SIDES},
         }
-        self._fingers = {side: [self._slot(f"{side}_finger_{k}") for k in (1, 2)] for side in SIDES}
+        self._grippers = {side: (self._slot(g.joint), g.position) for side, g in robot.grippers.items()}
+        self._follow = robot.follow
 
     def _slot(self, joint: str) -> int:
         return self._plant.GetJointByName(joint).position_start()
@@ -50,7 +51,9 @@ class RobotFrames:
         q[self._slots["torso"]] = state.torso
         for side in SIDES:
             q[self._slots[side]] = getattr(state, f"{side}_arm")
-            q[self._fingers[side]] = getattr(state, f"{side}_gripper") / 2
+            slot, position = self._grippers[side]
+            q[slot] = position(getattr(state, f"{side}_gripper"))
+        self._follow(q)
         self._plant.SetPositions(self._context, q)
         X_WB = self._poses.Eval(self._context)  # of all bodies
         out = [(ODOMETRY, name, X_WB[i].GetAsMatrix34()) for i, name in self._bodies.items()] + self._constant

@@ -33,7 +33,10 @@ from valve_drake import messages
 from valve_drake.messages import Message, array
 
 PACKAGE = "valve_drake"
-UNLOGGED: dict[type[Message], tuple[str, ...]] = {messages.CameraFrame: ("image", "data")}
+UNLOGGED: dict[type[Message], tuple[str, ...]] = {
+    messages.CameraFrame: ("image", "data"),
+    messages.RobotState: ("history",),  # what the messages before have said
+}
 
 _Field = descriptor_pb2.FieldDescriptorProto
 _ONE_BYTE = [bytes([n]) for n in range(256)]
@@ -228,8 +231,7 @@ def _field_codec(kind: type[Message], field: dc.Field[Any], hint: Any) -> _Field
 
 def _array_codec(kind: type[Message], field: dc.Field[Any]) -> _FieldCodec:
     shape, optional = field.metadata["shape"], field.metadata["optional"]
-    if shape.count(-1) > (0 if optional else 1):
-        # The shape could not be recovered from the number of values, or an empty array not distinguished from None.
+    if shape.count(-1) > 1:  # the shape could not be recovered from the number of values
         raise TypeError(f"{kind.__name__}.{field.name}: no protobuf for an array {shape}, optional={optional}")
 
     def put(value: np.ndarray | None) -> bytes:

@@ -46,6 +46,7 @@ from valve_drake.recording import foxglove
 from valve_drake.recording.recorder_system import ONCE, Signal
 from valve_drake.recording.refilled import STAMP, Refilled, slot
 from valve_drake.recording.schemas import Encoded, Vector, Wrench, proto_class, serialized
+from valve_drake.robot.groups import Groups
 from valve_drake.task.modes import BEHAVIORS
 
 SLOW = 1 / 32  # period of large messages and of those that only people look at [s]
@@ -89,53 +90,66 @@ TRUTH: dict[str, tuple[str, ...]] = {  # port of the simulated station -> names 
     "truth.stem_wrench": ("tx", "ty", "tz", "fx", "fy", "fz"),
 }
 
-TORSO = ("waist", "neck_pitch", "neck_yaw")
-MEASURED: dict[str, tuple[str, ...]] = {  # port of the station -> <joint>.<quantity> of its values
-    "base.odometry": (
-        "base_x.position",
-        "base_y.position",
-        "base_heading.position",
-        "base_forward.velocity",
-        "base_heading.velocity",
-    ),
-    "torso.position_measured": tuple(f"{joint}.position" for joint in TORSO),
-}
-COMMANDED = {
-    "base.twist_command": ("base_forward.velocity", "base_heading.velocity"),
-    "torso.position_command": tuple(f"{joint}.position" for joint in TORSO),
-}
-for _side in SIDES:
-    _arm = [f"{_side}_arm_{k}" for k in range(1, 7)]
-    MEASURED |= {
-        f"{_side}_arm.position_measured": tuple(f"{joint}.position" for joint in _arm),
-        f"{_side}_arm.velocity_measured": tuple(f"{joint}.velocity" for joint in _arm),
-        f"{_side}_arm.torque_measured": tuple(f"{joint}.effort" for joint in _arm),
-        f"{_side}_gripper.position_measured": (f"{_side}_gripper.position",),
-        f"{_side}_gripper.force_measured": (f"{_side}_gripper.effort",),
-    }
-    COMMANDED |= {
-        f"{_side}_arm.position_command": tuple(f"{joint}.position" for joint in _arm),
-        f"{_side}_gripper.position_command": (f"{_side}_gripper.position",),
-        f"{_side}_gripper.force_limit": (f"{_side}_gripper.effort",),
-    }
 
-JOINED = {"measured": MEASURED, "commanded": COMMANDED}  # vectors that the recorder reads through one port: cheaper
+def measured(groups: Groups) -> dict[str, tuple[str, ...]]:
+    """Ports of the station with what its joints do -> <joint>.<quantity> of each of their values."""
+    out: dict[str, tuple[str, ...]] = {
+        "base.odometry": (
+            "base_x.position",
+            "base_y.position",
+            "base_heading.position",
+            "base_forward.velocity",
+            "base_heading.velocity",
+        ),
+        "torso.position_measured": tuple(f"{joint}.position" for joint in groups.torso),
+    }
+    for side in SIDES:
+        arm = groups.names(f"{side}_arm")
+        out |= {
+            f"{side}_arm.position_measured": tuple(f"{joint}.position" for joint in arm),
+            f"{side}_arm.velocity_measured": tuple(f"{joint}.velocity" for joint in arm),
+            f"{side}_arm.torque_measured": tuple(f"{joint}.effort" for joint in arm),
+            f"{side}_gripper.position_measured": (f"{side}_gripper.position",),
+            f"{side}_gripper.force_measured": (f"{side}_gripper.effort",),
+        }
+    return out
+
+
+def commanded(groups: Groups) -> dict[str, tuple[str, ...]]:
+    """The same of the station's inputs."""
+    out: dict[str, tuple[str, ...]] = {
+        "base.twist_command": ("base_forward.velocity", "base_heading.velocity"),
+        "torso.position_command": tuple(f"{joint}.position" for joint in groups.torso),
+    }
+    for side in SIDES:
+        out |= {
+            f"{side}_arm.position_command": tuple(f"{joint}.position" for joint in groups.names(f"{side}_arm")),
+            f"{side}_gripper.position_command": (f"{side}_gripper.position",),
+            f"{side}_gripper.force_limit": (f"{side}_gripper.effort",),
+        }
+    return out
+
+
+# Vectors that the recorder reads through one port, which is cheaper: its name -> of a robot, the ports that it joins.
+JOINED = {"measured": measured, "commanded": commanded}
 
 
 def signals(
+    groups: Groups,
     frames: Callable[..., Iterable[tuple[str, str, np.ndarray]]],
     scene: SceneUpdate | None = None,
     calibrations: Mapping[str, tuple[tuple[int, int], np.ndarray]] | None = None,
 ) -> list[Signal]:
     """All rows of the program's log.
 
+    groups: the robot's joints.
     frames: (robot state, estimate, plan, turn) -> (parent, child, X (3, 4)) of every frame to show.
     scene: the shapes that are drawn in these frames.
     calibrations: camera -> its (width, height) and pinhole matrix (3, 3) [px].
     """
     rows = [output(block, port, kind) for block, port, kind in OUTPUTS]
     rows += [output("robot_state", "robot_state", RobotState, SLOW)]
-    rows += [joints("/joint_states", "measured"), joints("/joint_commands", "commanded")]
+    rows += [joints("/joint_states", "measured", groups), joints("/joint_commands", "commanded", groups)]
     rows += [wrench(side) for side in SIDES]
     rows += [Signal("/health", {"health": Health}, as_it_is)]
     rows += [row for side in SIDES for row in (*head_camera(side), *wrist_camera(side))]
@@ -186,10 +200,10 @@ def numbers(form: Refilled) -> Callable[..., Encoded]:
     return lambda time, values: form.fill(foxglove.nanoseconds(time), [time, *values.tolist()])
 
 
-def joints(topic: str, port: str) -> Signal:
+def joints(topic: str, port: str, groups: Groups) -> Signal:
     """A port that joins others (JOINED) as JointStates; the quantities are position, velocity and effort."""
     states, by_name = JointStates(timestamp=STAMP), {}
-    values = [value.split(".") for names in JOINED[port].values() for value in names]
+    values = [value.split(".") for names in JOINED[port](groups).values() for value in names]
     for k, (joint, quantity) in enumerate(values):
         if joint not in by_name:
             by_name[joint] = states.joints.add(name=joint)

@@ -66,7 +66,8 @@ class GazeDescription(Config):
     waist: str = plain("", "joint, where there is one")
     pan: str = plain("", "joint")
     tilt: str = plain("", "joint")
-    speed: float = number(1.5, 0.05, 10.0, "of each, at most [rad/s]")
+    speed: float = number(1.5, 0.05, 10.0, "of pan and tilt, at most [rad/s]")
+    waist_speed: float = number(0.8, 0.05, 10.0, "of the waist, at most [rad/s]")
 
     def relations(self, key: str) -> None:
         for name in ("pan", "tilt"):

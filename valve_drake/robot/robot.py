@@ -9,7 +9,7 @@ that its answer depends on, so the same question gives the same bits, and copies
 
 import dataclasses as dc
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -24,6 +24,7 @@ from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.robot import description as descriptions
 from valve_drake.robot import kinematics
 from valve_drake.robot.description import TORQUE, RobotDescription
+from valve_drake.robot.groups import Groups
 from valve_drake.robot.kinematics import Arm, HandLoad, Joints
 from valve_drake.robot.model import (
     Mimic,
@@ -96,11 +97,15 @@ class Robot:
         gaze = {key: joint[f"gaze.{key}"] for key in ("waist", "tilt", "pan") if f"gaze.{key}" in joint}
         held = [*lift, *(gaze[key] for key in ("waist",) if key in gaze)]
         rest = [*d.lift.home, *(0.0 for key in ("waist",) if key in gaze)]
-        speed = [*d.lift.speed, *(d.gaze.speed for key in ("waist",) if key in gaze)]
+        speed = [*d.lift.speed, *(d.gaze.waist_speed for key in ("waist",) if key in gaze)]
         head = [gaze["tilt"], gaze["pan"]]
         self.posture = _joints(held, speed, rest)
         self.torso = _joints([*held, *head], [*speed, d.gaze.speed, d.gaze.speed], [*rest, 0.0, 0.0])
         _check_within(self.posture, "lift.home")
+        _check_speeds("lift.speed", lift, d.lift.speed)
+        for name, turning in gaze.items():
+            field = "waist_speed" if name == "waist" else "speed"
+            _check_speeds(f"gaze.{field}", [turning], [getattr(d.gaze, field)])
         self.arms = MappingProxyType({side: _arm(plant, index, d, side, joint) for side in SIDES})
         self.home = _locked(np.concatenate([self.arms[side].home for side in SIDES]))
 
@@ -119,7 +124,7 @@ class Robot:
             q[_positions([joint[f"arms.{side}.joints[{k}]"] for k in range(len(self.arms[side]))])] = self.arms[
                 side
             ].home
-        self._follow(q)
+        self.follow(q)
         self._home_q = q
         self._chains = {side: self._chain(side, joint) for side in SIDES}
         self._check_sides()
@@ -127,7 +132,7 @@ class Robot:
         self.grippers = MappingProxyType({side: self._gripper(side, joint[f"grippers.{side}.joint"]) for side in SIDES})
         for side in SIDES:
             q[joint[f"grippers.{side}.joint"].position_start()] = self.grippers[side].position(d.opening)
-        self._follow(q)
+        self.follow(q)
         self.hands = MappingProxyType({side: self._hand(side) for side in SIDES})
         self._scratch = q.copy()
         for name in ("_home_q", "_torso_q", "_posture_q"):
@@ -141,6 +146,17 @@ class Robot:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Robot":
         return self
+
+    @property
+    def waist(self) -> int | None:
+        """Which of the torso's joints is the waist; None: the robot has none."""
+        name = self.description.gaze.waist
+        return self.torso.names.index(name) if name else None
+
+    @property
+    def groups(self) -> Groups:
+        """The joints that are commanded by position."""
+        return Groups(self.torso.names, self.arms[LEFT].names, self.arms[RIGHT].names)
 
     @staticmethod
     def load(path: str | Path) -> "Robot":
@@ -229,7 +245,27 @@ class Robot:
         """Of an arm from its limits and singularities: 1 is comfortable, 0 at a limit, negative beyond."""
         return kinematics.margin(q, self.jacobian(side, q), self.arms[side])
 
-    # ------------------------------------------------------------ for who has a Context of his own
+    # ------------------------------------------------------------ for who has a plant or a Context of his own
+    def named(
+        self,
+        *,
+        base: Iterable[float] = (),
+        torso: Iterable[float] = (),
+        arms: Mapping[str, np.ndarray] = MappingProxyType({}),
+        opening: float | None = None,
+    ) -> dict[str, float]:
+        """Joint of the model -> position, of the groups that are given; opening: of both grippers [m].
+
+        base: x, y, heading; none of them for a base that has no joints.
+        """
+        out = dict(zip(self.base.names, base)) | dict(zip(self.torso.names, torso))
+        for side, q in arms.items():
+            out |= dict(zip(self.arms[side].names, q))
+        if opening is not None:
+            out |= {gripper.joint: gripper.position(opening) for gripper in self.grippers.values()}
+        followers = {m.joint: m.multiplier * out[m.follows] + m.offset for m in self.model.mimics if m.follows in out}
+        return {name: float(value) for name, value in (out | followers).items()}
+
     def slots(self, joints: Sequence[str]) -> np.ndarray:
         """Where these joints' positions stand in the positions of the model's plant."""
         return _positions([joint_named(self._plant, self.model.robot, name, "joint") for name in joints])
@@ -239,7 +275,7 @@ class Robot:
         q = self._home_q.copy()
         for gripper in self.grippers.values():
             q[self.slots([gripper.joint])] = gripper.position(opening)
-        self._follow(q)
+        self.follow(q)
         return q
 
     # ------------------------------------------------------------ scratch
@@ -263,7 +299,7 @@ class Robot:
         )
         return J[:, chain.v]
 
-    def _follow(self, q: np.ndarray) -> None:
+    def follow(self, q: np.ndarray) -> None:
         """Puts the joints that follow others where they belong, in the plant's positions."""
         for follower, leader, multiplier, offset in self._mimics:
             q[follower] = multiplier * q[leader] + offset
@@ -328,7 +364,7 @@ class Robot:
         q = self._home_q.copy()
         for position in positions:
             q[joint.position_start()] = position
-            self._follow(q)
+            self.follow(q)
             plant.SetPositions(self._context, q)
             points = [plant.CalcPointsPositions(self._context, *pad, grip)[1, 0] for pad in zip(pads, surfaces)]
             distances.append(points[0] - points[1])
@@ -358,7 +394,7 @@ class Robot:
         for other in SIDES:
             joint = joint_named(plant, index, d.gripper(other).joint, "")
             q[joint.position_start()] = self.grippers[other].position(d.opening)
-        self._follow(q)
+        self.follow(q)
         plant.SetPositions(self._context, q)
         frame = sensor.frame_on_child()
         X_SG = plant.CalcRelativeTransform(self._context, frame, chain.grip).GetAsMatrix34()
@@ -413,6 +449,14 @@ def _check_within(group: Joints, key: str, values: np.ndarray | None = None) -> 
         )
 
 
+def _check_speeds(key: str, joints: list[Joint], speeds: Sequence[float]) -> None:
+    """No joint is asked for more than its model allows."""
+    for k, (joint, speed) in enumerate(zip(joints, speeds)):
+        most = joint.velocity_upper_limits()[0]
+        words = f"at most {most:g}, {joint.name()}'s limit"
+        require(speed <= most, f"{key}[{k}]" if len(speeds) > 1 else key, words, speed)
+
+
 def _base(plant: MultibodyPlant, index: ModelInstanceIndex, d: RobotDescription, frame: Frame) -> Joints:
     chain = base_chain(plant, index, frame.body())
     kinds = [joint.type_name() for joint in chain]
@@ -433,6 +477,7 @@ def _arm(
     work = _locked(np.array(spec.work or spec.home))
     arm = Arm(**_group(joints, d.arm_speed, spec.home), work=work)
     _check_within(arm, f"arms.{side}.home")
+    _check_speeds("arm_speed", joints, d.arm_speed)
     _check_within(arm, f"arms.{side}.work", work)
     return arm
 

@@ -10,6 +10,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, PortD
 
 from valve_drake.messages import CAMERAS as CAMERAS
 from valve_drake.messages import SIDES, CameraFrame, Health
+from valve_drake.robot.groups import Groups
 
 HEAD, WRISTS = CAMERAS[:2], CAMERAS[2:]
 MATE = {HEAD[0]: HEAD[1], HEAD[1]: HEAD[0], WRISTS[0]: WRISTS[1], WRISTS[1]: WRISTS[0]}  # the other one of a pair
@@ -18,36 +19,44 @@ TRUTH = "truth."
 
 @dc.dataclass(frozen=True)
 class PortSpec:
-    """One row of the contract. kind: vector size, or message class."""
+    """One row of the contract. kind: size of a vector, the group of joints that it is of, or a message class."""
 
     name: str
     direction: str  # in | out
-    kind: int | type
+    kind: int | str | type
     unit: str
     notes: str = ""
 
 
-def _both(name: str, direction: str, kind: int | type, unit: str, notes: str = "") -> list[PortSpec]:
-    return [PortSpec(f"{side}_{name}", direction, kind, unit, notes) for side in SIDES]
+def _both(name: str, direction: str, kind: int | str, unit: str, notes: str = "") -> list[PortSpec]:
+    """A row for each side; kind "arm": that side's."""
+    kinds = {side: f"{side}_arm" if kind == "arm" else kind for side in SIDES}
+    return [PortSpec(f"{side}_{name}", direction, kinds[side], unit, notes) for side in SIDES]
 
 
 CONTRACT: tuple[PortSpec, ...] = (
     PortSpec("base.twist_command", "in", 2, "m/s, rad/s", "forward, yaw rate"),
-    PortSpec("torso.position_command", "in", 3, "rad", "waist twist, neck pitch, neck yaw"),
-    *_both("arm.position_command", "in", 6, "rad"),
+    PortSpec("torso.position_command", "in", "torso", "rad, m", "lift and waist, if there are; tilt, pan"),
+    *_both("arm.position_command", "in", "arm", "rad"),
     *_both("gripper.position_command", "in", 1, "m", "opening between the pads"),
     *_both("gripper.force_limit", "in", 1, "N", "of the finger actuator"),
     PortSpec("base.odometry", "out", 5, "m, rad, m/s, rad/s", "x, y, heading, forward, yaw rate; drifts"),
-    PortSpec("torso.position_measured", "out", 3, "rad"),
-    *_both("arm.position_measured", "out", 6, "rad"),
-    *_both("arm.velocity_measured", "out", 6, "rad/s"),
-    *_both("arm.torque_measured", "out", 6, "N m"),
+    PortSpec("torso.position_measured", "out", "torso", "rad, m"),
+    *_both("arm.position_measured", "out", "arm", "rad"),
+    *_both("arm.velocity_measured", "out", "arm", "rad/s"),
+    *_both("arm.torque_measured", "out", "arm", "N m"),
     *_both("gripper.position_measured", "out", 1, "m"),
     *_both("gripper.force_measured", "out", 1, "N"),
     *_both("wrist.wrench", "out", 6, "N m, N", "at and in the sensor frame; load felt by the sensor, with gravity"),
     *(PortSpec(f"{camera}.image", "out", CameraFrame, "") for camera in CAMERAS),
     PortSpec("health", "out", Health, "s", "age of every device's last report, faults, e-stop"),
 )
+
+
+def vectors(groups: Groups, direction: str = "") -> dict[str, int]:
+    """The contract's vector ports for a robot, of one direction or of both: name -> size."""
+    rows = [spec for spec in CONTRACT if direction in ("", spec.direction)]
+    return {spec.name: groups.size(spec.kind) for spec in rows if not isinstance(spec.kind, type)}
 
 
 def ports_of(station: Diagram) -> dict[str, tuple[str, int | str]]:
@@ -64,10 +73,11 @@ def ports_of(station: Diagram) -> dict[str, tuple[str, int | str]]:
     return found
 
 
-def check_contract(station: Diagram) -> None:
+def check_contract(station: Diagram, groups: Groups) -> None:
     """Raises TypeError that lists every missing, extra or different port."""
+    sizes = vectors(groups)
     found = {name: row for name, row in ports_of(station).items() if not name.startswith(TRUTH)}
-    wanted = {s.name: (s.direction, s.kind if isinstance(s.kind, int) else "abstract") for s in CONTRACT}
+    wanted = {s.name: (s.direction, sizes.get(s.name, "abstract")) for s in CONTRACT}
     wrong = [f"missing {name}" for name in wanted if name not in found]
     wrong += [f"extra {name}" for name in found if name not in wanted]
     wrong += [
@@ -79,7 +89,7 @@ def check_contract(station: Diagram) -> None:
         raise TypeError(f"{station.get_name()} breaks the station contract: " + "; ".join(wrong))
 
 
-def station_of(name: str, inputs: LeafSystem, outputs: LeafSystem) -> Diagram:
+def station_of(name: str, inputs: LeafSystem, outputs: LeafSystem, groups: Groups) -> Diagram:
     """The station as a Diagram: one system has the contract's input ports under their names, one the output ports."""
     builder = DiagramBuilder()
     for system in {id(system): system for system in (outputs, inputs)}.values():
@@ -91,5 +101,5 @@ def station_of(name: str, inputs: LeafSystem, outputs: LeafSystem) -> Diagram:
             builder.ExportOutput(outputs.GetOutputPort(spec.name), spec.name)
     station = builder.Build()
     station.set_name(name)
-    check_contract(station)
+    check_contract(station, groups)
     return station

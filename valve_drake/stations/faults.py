@@ -29,7 +29,8 @@ from valve_drake.checks import require
 from valve_drake.config import Config, choice, number
 from valve_drake.messages import Mode
 from valve_drake.ports import TICK
-from valve_drake.stations.lcm_channels import CHANNELS, DEVICES, JOINTS
+from valve_drake.robot.groups import GROUPS
+from valve_drake.stations.lcm_channels import CHANNELS, DEVICES
 
 WIRE = ("latency", "loss", "duplicate", "reorder")
 DEVICE = ("frozen", "nan", "dead", "restart", "stuck", "estop")
@@ -55,9 +56,7 @@ class FaultConfig(Config):
         if self.kind == "restart":
             require(self.duration > 0, f"{key}.duration", "> 0 for a restart", self.duration)
         if self.kind == "stuck":
-            count = JOINTS.get(self.device, 0)
-            require(count > 0, f"{key}.device", f"one of {', '.join(JOINTS)} for stuck", self.device)
-            require(self.joint < count, f"{key}.joint", f"within [0, {count - 1}]", self.joint)
+            require(self.device in GROUPS, f"{key}.device", f"one of {', '.join(GROUPS)} for stuck", self.device)
 
 
 class Faults:

@@ -35,16 +35,16 @@ from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.console import complain
 from valve_drake.messages import SIDES, CameraFrame, Health
 from valve_drake.ports import SLOT, TICK, PythonSystem
+from valve_drake.robot.groups import GROUPS, Groups
 from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rig import decode_image
-from valve_drake.stations.contract import CAMERAS, CONTRACT, HEAD, station_of
+from valve_drake.stations.contract import CAMERAS, CONTRACT, HEAD, station_of, vectors
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
     CONTROLLER,
     DEVICES,
     IMAGES,
-    JOINTS,
     LOCKSTEP_TIME,
     MODE,
     PROTOCOL,
@@ -55,6 +55,7 @@ from valve_drake.stations.lcm_channels import (
     SYNC,
     Values,
     WrongMessage,
+    check_sizes,
     from_utime,
     read_image,
     read_named,
@@ -106,11 +107,10 @@ class Snapshot:
         return self
 
 
-BEFORE = Snapshot(  # what the ports show until the station is initialised
-    {s.name: np.full(s.kind, np.nan) for s in CONTRACT if s.direction == "out" and isinstance(s.kind, int)},
-    dict.fromkeys(CAMERAS),
-    Health(),
-)
+def _before(groups: Groups) -> Snapshot:
+    """What the ports show until the station is initialised."""
+    values = {name: np.full(size, np.nan) for name, size in vectors(groups, "out").items()}
+    return Snapshot(values, dict.fromkeys(CAMERAS), Health())
 
 
 class CameraRequests:
@@ -138,19 +138,23 @@ class CameraRequests:
 class RobotLink:
     """The program's end of the wire.
 
-    idle: called while this side waits for the robot with nothing to do; a robot in the same process steps there.
+    groups: the joints of the robot at the other end. idle: called while this side waits for the robot with nothing to
+    do; a robot in the same process steps there.
     notice: tells the user, one line, what is waited for. stop: True ends the wait for a robot.
     """
 
     def __init__(
         self,
         bus: Bus,
+        groups: Groups,
         idle: Callable[[], None] | None = None,
         *,
         notice: Callable[[str], None] = complain,
         stop: Callable[[], bool] = lambda: False,
     ):
         self.bus = bus
+        self.groups = groups
+        self._sizes = vectors(groups)
         self.stop = stop
         self._config = bus.config
         self._idle = idle or (lambda: wall.sleep(2e-4))
@@ -193,7 +197,7 @@ class RobotLink:
     def _read(self, key: str, message: Any) -> None:
         row = CHANNELS[key]
         if row.read is not None:
-            self._take(key, getattr(message, row.stamp), row.read(message))
+            self._take(key, getattr(message, row.stamp), check_sizes(row.read(message), self._sizes))
         elif key == STATE:
             self._take(key, message.timestamp, read_named(message))
         elif row.device in IMAGES:
@@ -288,7 +292,8 @@ class RobotLink:
         if state.get("protocol") != PROTOCOL:
             spoken = state.get("protocol", math.nan)
             raise ConfigError(f"the robot speaks version {spoken:g} of the protocol, this program {PROTOCOL}")
-        for device, count in JOINTS.items():
+        for device in GROUPS:
+            count = self.groups.size(device)
             if state.get(device) != count:
                 raise ConfigError(f"the robot's {device} has {state.get(device, math.nan):g} joints, want {count}")
         if self._config.lockstep:
@@ -373,7 +378,7 @@ class RobotLink:
             ages.append(0.0 if since is None else now - max(since, last))
         ages.append(now - self._reports[STATE].arrival)
         state = self._reports[STATE].values
-        faults = [name for name, value in state.items() if name not in ("protocol", "estop", *JOINTS) and value]
+        faults = [name for name, value in state.items() if name not in ("protocol", "estop", *GROUPS) and value]
         faults += self._bad.faults(now)
         faults += ["another program commands this robot"] if self.bus.others(CONTROLLER) else []
         faults += ["two robots on the bus"] if self.bus.others(ROBOT) > 1 else []
@@ -494,18 +499,19 @@ class LcmReceiver(PythonSystem):
         super().__init__()
         self.set_name("lcm_receiver")
         self._link = link
-        self._snapshot = self.DeclareAbstractState(Value(BEFORE))
+        self._snapshot = self.DeclareAbstractState(Value(_before(link.groups)))
         self.DeclareInitializationUnrestrictedUpdateEvent(lambda context, state: self._keep(state, link.start()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             TICK, TICK - AHEAD, lambda context, state: self._keep(state, link.update(context.get_time() + AHEAD))
         )
         when = {self.abstract_state_ticket(self._snapshot)}
+        sizes = vectors(link.groups)
         for spec in CONTRACT:
             if spec.direction == "in":
                 continue
-            if isinstance(spec.kind, int):
+            if not isinstance(spec.kind, type):
                 calc: Callable[..., None] = functools.partial(self._calc_vector, spec.name)
-                self.DeclareVectorOutputPort(spec.name, spec.kind, calc, when)
+                self.DeclareVectorOutputPort(spec.name, sizes[spec.name], calc, when)
             else:
                 calc = self._calc_health if spec.kind is Health else self._calc_image(spec.name.partition(".")[0])
                 self.DeclareAbstractOutputPort(spec.name, functools.partial(Value, spec.kind()), calc, when)
@@ -536,7 +542,8 @@ class LcmSender(PythonSystem):
         super().__init__()
         self.set_name("lcm_sender")
         self._link = link
-        self._commands = {s.name: self.DeclareVectorInputPort(s.name, s.kind) for s in CONTRACT if s.direction == "in"}
+        sizes = vectors(link.groups, "in")
+        self._commands = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
         self.DeclarePeriodicPublishEvent(TICK, 3 * SLOT, self._publish)
 
     def _publish(self, context: Context) -> None:
@@ -546,4 +553,4 @@ class LcmSender(PythonSystem):
 
 def make_hardware_station(link: RobotLink) -> Diagram:
     """The station as a Diagram named `hardware`."""
-    return station_of("hardware", inputs=LcmSender(link), outputs=LcmReceiver(link))
+    return station_of("hardware", inputs=LcmSender(link), outputs=LcmReceiver(link), groups=link.groups)

@@ -39,7 +39,6 @@ MODE, REQUEST, STATE = "controller.mode", "cameras.request", "robot.state"
 SYNC = {ROBOT: "robot.sync", CONTROLLER: "controller.sync"}
 PRESENCE = {ROBOT: "robot.presence", CONTROLLER: "controller.presence"}
 UNCOUNTED = frozenset((*SYNC.values(), *PRESENCE.values()))  # that lock-step's count of messages leaves out
-JOINTS = {"torso": 3, "left_arm": 6, "right_arm": 6}  # of a device: how many
 LOCKSTEP_TIME = 60.0  # lock-step: how long either side may think about one tick [s, wall]
 MM = 1e3  # Drake's gripper messages are in mm
 CHANNEL_NAME = re.compile(r"[!-~]{1,63}")  # LCM drops longer ones
@@ -82,6 +81,14 @@ class Channel:
         return message
 
 
+def check_sizes(values: Values, sizes: Mapping[str, int]) -> Values:
+    """The values of a message, whose vectors have the robot's sizes (contract.vectors). Raises WrongMessage."""
+    for port, value in values.items():
+        if len(value) != sizes[port]:
+            raise WrongMessage(f"{len(value)} joints, want {sizes[port]}")
+    return values
+
+
 def _count(wanted: int, found: int, what: str) -> None:
     if found != wanted:
         raise WrongMessage(f"{found} {what}, want {wanted}")
@@ -105,26 +112,23 @@ def signal(values: Mapping[str, float]) -> lcmt_drake_signal:
     return message
 
 
-def _joint_command(port: str, n: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _joint_command(port: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
     def write(values: Values) -> lcmt_iiwa_command:
         message = lcmt_iiwa_command()
-        message.num_joints, message.joint_position = n, values[port].tolist()
+        message.num_joints, message.joint_position = len(values[port]), values[port].tolist()
         return message
 
     def read(message: lcmt_iiwa_command) -> Values:
-        _count(n, message.num_joints, "joints")
         return {port: np.array(message.joint_position)}
 
     return write, read
 
 
-def _joint_status(
-    position: str, n: int, velocity: str = "", torque: str = ""
-) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _joint_status(position: str, velocity: str = "", torque: str = "") -> tuple[Callable[..., Any], Callable[..., Any]]:
     def write(values: Values) -> lcmt_iiwa_status:
-        zeros = [0.0] * n
+        zeros = [0.0] * len(values[position])
         message = lcmt_iiwa_status()
-        message.num_joints = n
+        message.num_joints = len(zeros)
         message.joint_position_measured = values[position].tolist()
         message.joint_velocity_estimated = values[velocity].tolist() if velocity else zeros
         message.joint_torque_measured = values[torque].tolist() if torque else zeros
@@ -133,7 +137,6 @@ def _joint_status(
         return message
 
     def read(message: lcmt_iiwa_status) -> Values:
-        _count(n, message.num_joints, "joints")
         out = {position: message.joint_position_measured}
         if velocity:
             out |= {velocity: message.joint_velocity_estimated, torque: message.joint_torque_measured}
@@ -185,15 +188,17 @@ def _rows() -> Iterable[Channel]:
         *_signal("base.twist_command", twist), stamp="timestamp",
     )  # fmt: skip
     joints = "joint_position [rad]; num_torques 0"
-    turns = "waist and neck_yaw to the left, neck_pitch downwards"
+    turns = "waist and pan to the left, tilt downwards"
+    torso = "lift and waist, if the robot has them, tilt, pan"
     yield Channel(
-        "torso.command", CONTROLLER, lcmt_iiwa_command, TICKS, f"waist, neck_pitch, neck_yaw: {joints}; {turns}",
-        *_joint_command("torso.position_command", JOINTS["torso"]),
+        "torso.command", CONTROLLER, lcmt_iiwa_command, TICKS, f"{torso}: {joints}; {turns}",
+        *_joint_command("torso.position_command"),
     )  # fmt: skip
     for side in SIDES:
         yield Channel(
-            f"{side}_arm.command", CONTROLLER, lcmt_iiwa_command, TICKS, f"6 joints, shoulder to wrist: {joints}",
-            *_joint_command(f"{side}_arm.position_command", JOINTS[f"{side}_arm"]),
+            f"{side}_arm.command", CONTROLLER, lcmt_iiwa_command, TICKS,
+            f"the arm's joints, shoulder to wrist: {joints}",
+            *_joint_command(f"{side}_arm.position_command"),
         )  # fmt: skip
         yield Channel(
             f"{side}_gripper.command", CONTROLLER, lcmt_schunk_wsg_command, TICKS,
@@ -210,16 +215,14 @@ def _rows() -> Iterable[Channel]:
     )  # fmt: skip
     yield Channel(
         "torso.status", ROBOT, lcmt_iiwa_status, TICKS,
-        f"waist, neck_pitch, neck_yaw: joint_position_measured [rad], signs as commanded; {_UNUSED}",
-        *_joint_status("torso.position_measured", JOINTS["torso"]),
+        f"{torso}: joint_position_measured [m, rad], signs as commanded; {_UNUSED}",
+        *_joint_status("torso.position_measured"),
     )  # fmt: skip
     for side in SIDES:
         arm, gripper = f"{side}_arm", f"{side}_gripper"
         yield Channel(
-            f"{arm}.status", ROBOT, lcmt_iiwa_status, TICKS, f"6 joints: {_ARM}; {_UNUSED}",
-            *_joint_status(
-                f"{arm}.position_measured", JOINTS[arm], f"{arm}.velocity_measured", f"{arm}.torque_measured"
-            ),
+            f"{arm}.status", ROBOT, lcmt_iiwa_status, TICKS, f"the arm's joints: {_ARM}; {_UNUSED}",
+            *_joint_status(f"{arm}.position_measured", f"{arm}.velocity_measured", f"{arm}.torque_measured"),
         )  # fmt: skip
         yield Channel(
             f"{gripper}.status", ROBOT, lcmt_schunk_wsg_status, TICKS,

@@ -25,17 +25,20 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource
 
 from valve_drake import profiling
+from valve_drake.checks import require
 from valve_drake.messages import SIDES
 from valve_drake.ports import SLOT, TICK, PythonSystem
 from valve_drake.robot.description import RobotDescription
-from valve_drake.stations.contract import CONTRACT
-from valve_drake.stations.scene import BASE, TORSO, add_scene, arm_joints
+from valve_drake.robot.groups import GROUPS
+from valve_drake.robot.robot import Gripper, Robot
+from valve_drake.stations.contract import CONTRACT, vectors
+from valve_drake.stations.scene import add_scene
 from valve_drake.stations.simulation_config import ValveConfig
 
+STRAIGHT = 2e-4  # an opening may leave the straight line over its joint by so much [m]
 STEPS = 2  # of the plant in a tick; twice as many leave forces and angles as they are and double the work
-FINGER_STIFFNESS = 2e4  # of the finger servo, as in the model file [N/m]
-COMMANDS = {spec.name: spec.kind for spec in CONTRACT if spec.direction == "in" and isinstance(spec.kind, int)}
-LOADED = {**{side: f"{side}_wrist_sensor" for side in SIDES}, "stem": "stem"}  # output port -> joint
+COMMANDS = tuple(spec.name for spec in CONTRACT if spec.direction == "in")
+STEM = "stem"  # the valve's joint, and the output port of its load
 
 
 _Pose = tuple[float, float, float]  # x, y, heading [m, rad]
@@ -82,10 +85,10 @@ class PlantSystem(PythonSystem):
         marker_size: tuple[float, float],
         start: Mapping[str, float],
         offsets: Mapping[str, np.ndarray],
-        robot: RobotDescription | None = None,
+        robot: Robot,
     ):
         """start: joint of the robot -> where it is at first [m, rad]; offsets: side -> what the arm's encoders read at
-        the joints' true zero (6,) [rad]: an arm goes to where its encoders read the command."""
+        the joints' true zero (n,) [rad]: an arm goes to where its encoders read the command."""
         super().__init__()
         self.set_name("plant")
         builder = DiagramBuilder()
@@ -99,7 +102,7 @@ class PlantSystem(PythonSystem):
         self.plant, self.scene_graph = AddMultibodyPlant(config, builder)
         self.plant.set_name("plant")
         self.scene_graph.set_name("scene_graph")
-        scene = add_scene(self.plant, valve, marker_size, robot)
+        scene = add_scene(self.plant, valve, marker_size, robot.description)
         self.robot, self.valve = scene.robot, scene.valve
         self.plant.Finalize()
         _leave_out_looks(self.plant, self.scene_graph)
@@ -116,14 +119,19 @@ class PlantSystem(PythonSystem):
 
         joints = [self.plant.get_joint_actuator(i).joint() for i in self.plant.GetJointActuatorIndices(self.robot)]
         self.actuated = order = [joint.name() for joint in joints]
-        fingers = [f"{side}_finger_1" for side in SIDES]
-        self._sent = [order.index(j) for names in (TORSO, *map(arm_joints, SIDES)) for j in names]
-        self._zeros = np.concatenate([np.zeros(len(TORSO)), *(offsets[side] for side in SIDES)])
-        self._base_at = [order.index(name) for name in BASE]
+        fingers = [robot.grippers[side].joint for side in SIDES]
+        self._sent = [order.index(j) for names in map(robot.groups.names, GROUPS) for j in names]
+        self._zeros = np.concatenate([np.zeros(len(robot.torso)), *(offsets[side] for side in SIDES)])
+        self.base = robot.base.names
+        self._base_at = [order.index(name) for name in self.base]
         self._fingers = [(order.index(name), joints[order.index(name)].position_start()) for name in fingers]
         self._actuated_at = [joint.velocity_start() for joint in joints]
+        self.opening = {side: _opening(robot.grippers[side], side) for side in SIDES}
+        gains = [self.plant.GetJointActuatorByName(name, self.robot).get_controller_gains() for name in fingers]
+        self._stiffness = [gain.p for gain in gains]
 
-        self._inputs = {name: self.DeclareVectorInputPort(name, size) for name, size in COMMANDS.items()}
+        sizes = vectors(robot.groups, "in")
+        self._inputs = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
         self._scratch = self.diagram.CreateDefaultContext()
         self._lock = threading.Lock()  # of the scratch: two threads may advance two Contexts
         self._inner = self.plant.GetMyMutableContextFromRoot(self._scratch)
@@ -132,14 +140,15 @@ class PlantSystem(PythonSystem):
         self._fixed_feed_forward, self._feed_forward = self._fix("feed_forward", np.zeros(len(joints)))
         self._net_actuation = self.plant.get_net_actuation_output_port(self.robot)
         self._reaction_forces = self.plant.get_reaction_forces_output_port()
-        self._loads = [self.plant.GetJointByName(name).index() for name in LOADED.values()]
+        loaded = {side: robot.description.arm(side).sensor for side in SIDES} | {STEM: STEM}  # output port -> joint
+        self._loads = [self.plant.GetJointByName(name).index() for name in loaded.values()]
         self._x = self.DeclareDiscreteState(self.plant.GetPositionsAndVelocities(self._inner))
-        self._base = self.DeclareDiscreteState([start[name] for name in BASE])
+        self._base = self.DeclareDiscreteState([start[name] for name in self.base])
         self._actuation = self.DeclareDiscreteState(len(self.actuated))
-        self._load = [self.DeclareDiscreteState(6) for _ in LOADED]
+        self._load = [self.DeclareDiscreteState(6) for _ in loaded]
         self.DeclareStateOutputPort("state", self._x)
         self.DeclareStateOutputPort("actuation", self._actuation)
-        for name, index in zip(LOADED, self._load):
+        for name, index in zip(loaded, self._load):
             self.DeclareStateOutputPort(name, index)
         self.DeclarePeriodicUnrestrictedUpdateEvent(TICK, 2 * SLOT, self._update)
 
@@ -157,7 +166,7 @@ class PlantSystem(PythonSystem):
         commands, desired = self._commands(context), np.zeros(len(self._desired))
         self._set_joints(desired, commands)
         self._set_base(desired, tuple(base.tolist()), tuple(commands["base.twist_command"].tolist()), 0.0)
-        self._set_fingers(desired, x, _grips(commands))
+        self._set_fingers(desired, x, self._grips(commands))
         self.diagram.GetInputPort("desired").FixValue(inner, desired)
         self.diagram.GetInputPort("feed_forward").FixValue(inner, self._gravity(plant_context))
         return plant_context
@@ -170,6 +179,19 @@ class PlantSystem(PythonSystem):
     def _gravity(self, plant_context: Context) -> np.ndarray:
         """What the robot's actuators do to bear its weight (n,) [N m, N]."""
         return -self.plant.CalcGravityGeneralizedForces(plant_context)[self._actuated_at]
+
+    def _grips(self, commands: dict[str, np.ndarray]) -> list[tuple[float, float]]:
+        """Of each hand: where its finger is sent, how far from where it is the servo may pull it [rad or m].
+
+        A force limit is that on the finger: the joint's effort times the joint's way over half the opening's.
+        """
+        out = []
+        for side, stiffness in zip(SIDES, self._stiffness):
+            slope, zero = self.opening[side]
+            opening = float(commands[f"{side}_gripper.position_command"][0])
+            effort = float(commands[f"{side}_gripper.force_limit"][0]) * abs(slope) / 2
+            out.append(((opening - zero) / slope, effort / stiffness))
+        return out
 
     def _commands(self, context: Context) -> dict[str, np.ndarray]:
         return {name: port.Eval(context) for name, port in self._inputs.items()}
@@ -213,7 +235,7 @@ class PlantSystem(PythonSystem):
         scratch, desired = self._scratch, self._desired
         start: _Pose = tuple(base.tolist())
         twist: tuple[float, float] = tuple(commands["base.twist_command"].tolist())
-        grips = _grips(commands)
+        grips = self._grips(commands)
         scratch.SetDiscreteState(x)
         self._fixed_feed_forward.GetMutableData()  # tells the Context that the memory of `_feed_forward` changes
         self._feed_forward[:] = self._gravity(self._inner)
@@ -234,11 +256,13 @@ class PlantSystem(PythonSystem):
         return Stepped(np.array(x), np.array(_driven(start, twist, TICK)), actuation, loads)
 
 
-def _grips(commands: dict[str, np.ndarray]) -> list[tuple[float, float]]:
-    """Of each hand: where its finger is sent, how far from where it is the servo may pull it [m]."""
-    openings = (float(commands[f"{side}_gripper.position_command"][0]) for side in SIDES)
-    forces = (float(commands[f"{side}_gripper.force_limit"][0]) for side in SIDES)
-    return [(opening / 2, force / FINGER_STIFFNESS) for opening, force in zip(openings, forces)]
+def _opening(gripper: Gripper, side: str) -> tuple[float, float]:
+    """Slope and zero of the opening over the joint's position. Raises ConfigError for a gripper that is not linear."""
+    slope, zero = np.polyfit(gripper.positions, gripper.openings, 1)
+    off = float(np.abs(gripper.positions * slope + zero - gripper.openings).max())
+    words = f"one that opens in proportion, within {STRAIGHT} m"
+    require(off < STRAIGHT, f"grippers.{side}.joint", words, f"{off:.4f} m")
+    return float(slope), float(zero)
 
 
 def _driven(base: _Pose, twist: tuple[float, float], time: float) -> _Pose:

@@ -30,22 +30,24 @@ from valve_drake.messages import SIDES, CameraFrame
 from valve_drake.ports import TICK, PythonSystem
 from valve_drake.recording.foxglove import NANO, nanoseconds
 from valve_drake.recording.reader import LogReader, Record
-from valve_drake.recording.signals import FRAMES, JOINED, MEASURED, topic_of
+from valve_drake.recording.signals import FRAMES, JOINED, measured, topic_of
+from valve_drake.robot.groups import Groups
 from valve_drake.stations.camera_rig import decode_image
-from valve_drake.stations.contract import CAMERAS, CONTRACT, PortSpec, station_of
+from valve_drake.stations.contract import CAMERAS, CONTRACT, PortSpec, station_of, vectors
 
 JOINTS, HEALTH, OPERATOR = "/joint_states", "/health", "/operator/command"
 CONSUMERS = {topic_of(port) for port, _, _ in FRAMES.values()}
 _JOINT = "joints."
 _WRENCH = [f"{part}.{k}" for part in ("torque", "force") for k in range(3)]
-VECTORS: dict[str, dict[str, list[str]]] = {  # topic -> port -> where its values are in the topic's messages
-    JOINTS: {
-        port: [_JOINT + name for name in names]
-        for port, names in {**MEASURED, "measured": itertools.chain.from_iterable(MEASURED.values())}.items()
-    },
-    **{f"/{side}_wrist/wrench": {f"{side}_wrist.wrench": _WRENCH} for side in SIDES},
-}
+WRENCHES = {f"/{side}_wrist/wrench": {f"{side}_wrist.wrench": _WRENCH} for side in SIDES}
 IMAGES = {f"/{camera}/image": camera for camera in CAMERAS}
+
+
+def _vectors(groups: Groups) -> dict[str, dict[str, list[str]]]:
+    """Topic -> port -> where its values are in the topic's messages."""
+    ports = measured(groups)
+    joined = {**ports, "measured": itertools.chain.from_iterable(ports.values())}
+    return {JOINTS: {port: [_JOINT + name for name in names] for port, names in joined.items()}, **WRENCHES}
 
 
 class Track:
@@ -71,19 +73,21 @@ class Recording:
     tracks: Track by port of the contract: arrays, Health, or (time, CameraFrame without its image).
     joined: the same of the ports of the recorder that join several (signals.JOINED).
     requests: the operator's commands.
+    groups: the joints of the robot that was recorded.
     Raises ConfigError if the log lacks something that the stages read.
     """
 
-    def __init__(self, log: LogReader):
-        self._log = log
+    def __init__(self, log: LogReader, groups: Groups):
+        self._log, self.groups = log, groups
         self.tracks: dict[str, Track] = collections.defaultdict(Track)
         self.joined: dict[str, Track] = {}
         self.requests = Track()
-        needed = {HEALTH, OPERATOR, *VECTORS, *CONSUMERS}
+        topics = _vectors(groups)
+        needed = {HEALTH, OPERATOR, *topics, *CONSUMERS}
         if missing := sorted(needed - {name for name, topic in log.topics.items() if topic.count > 0}):
             raise ConfigError(f"{log.path} cannot be replayed: it has no messages of {', '.join(missing)}")
         images = set()  # topic, time
-        vectors: dict[str, list[Record]] = {topic: [] for topic in VECTORS}
+        vectors: dict[str, list[Record]] = {topic: [] for topic in topics}
         for record in log.records(needed | (IMAGES.keys() & log.topics)):
             topic, time = record.topic, record.time
             if topic in IMAGES:
@@ -94,7 +98,7 @@ class Recording:
                 self._add_frames(topic, time, log.decode(record))
             else:
                 (self.requests if topic == OPERATOR else self.tracks["health"]).add(time, log.decode(record))
-        for topic, ports in VECTORS.items():
+        for topic, ports in topics.items():
             self._add_vectors(vectors[topic], ports)
         self.end = self._sound_end()
         for camera in CAMERAS:
@@ -153,14 +157,14 @@ class RecordedStation(PythonSystem):
     def __init__(self, recording: Recording):
         super().__init__()
         self.set_name("recorded_station")
-        ports = shown(recording)
+        ports, sizes = shown(recording), vectors(recording.groups)
         for spec in CONTRACT:
             if spec.direction == "in":
-                self.DeclareVectorInputPort(spec.name, spec.kind)
+                self.DeclareVectorInputPort(spec.name, sizes[spec.name])
                 continue
             read, when = ports[spec.name], {self.time_ticket()}
-            if isinstance(spec.kind, int):
-                self.DeclareVectorOutputPort(spec.name, spec.kind, _vector(read), when)
+            if not isinstance(spec.kind, type):
+                self.DeclareVectorOutputPort(spec.name, sizes[spec.name], _vector(read), when)
             else:
                 self.DeclareAbstractOutputPort(spec.name, functools.partial(Value, spec.kind()), _message(read), when)
 
@@ -179,7 +183,7 @@ def shown(recording: Recording) -> dict[str, Callable[[float], Any]]:
 
     def reader(spec: PortSpec) -> Callable[[float], Any]:
         at = recording.tracks[spec.name].at
-        if isinstance(spec.kind, int):
+        if not isinstance(spec.kind, type):
             return at
         if spec.kind is CameraFrame:
             return lambda time: frame(*at(_next_tick(time)))
@@ -196,4 +200,4 @@ def _next_tick(time: float) -> float:
 def make_replay_station(recording: Recording) -> Diagram:
     """The station as a Diagram named `replay`."""
     station = RecordedStation(recording)
-    return station_of("replay", inputs=station, outputs=station)
+    return station_of("replay", inputs=station, outputs=station, groups=recording.groups)

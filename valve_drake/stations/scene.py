@@ -15,8 +15,6 @@ from valve_drake.robot import description, model
 from valve_drake.robot.description import RobotDescription
 from valve_drake.stations.simulation_config import StartConfig, ValveConfig
 
-TORSO = ("waist", "neck_pitch", "neck_yaw")  # joints of the robot's model, in the order of the contract
-BASE = ("base_x", "base_y", "base_yaw")
 MARKER_RED = (0.80, 0.06, 0.05, 1.0)
 MARKER_THICKNESS = 1e-5  # a sticker: a plate would show its rim to a camera from above [m]
 SEIZED = 1e4  # friction of a valve that does not turn [N m]
@@ -28,11 +26,6 @@ class Scene:
 
     robot: ModelInstanceIndex
     valve: ModelInstanceIndex
-
-
-def arm_joints(side: str) -> list[str]:
-    """The arm's joints in the robot's model, from the shoulder on."""
-    return [f"{side}_arm_{k}" for k in range(1, 7)]
 
 
 def parse(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:

@@ -5,7 +5,7 @@ Nothing is welded or moved by hand: the fingers hold the handles by friction and
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,14 +17,15 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
-from valve_drake.messages import DEVICES, SIDES, Health
+from valve_drake.messages import DEVICES, LEFT, SIDES, Health
 from valve_drake.ports import TICK, Block, Inputs, Outputs, PythonSystem
 from valve_drake.robot.description import RobotDescription
+from valve_drake.robot.robot import Robot
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, TRUTH, check_contract
 from valve_drake.stations.plant_system import COMMANDS, PlantSystem
-from valve_drake.stations.scene import BASE, TORSO, add_scene, arm_joints, panel_pose, start_pose
+from valve_drake.stations.scene import add_scene, panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig, ValveConfig
 
 
@@ -34,10 +35,11 @@ def _affine(gain: np.ndarray, offset: np.ndarray) -> AffineSystem:
     return AffineSystem(none, np.zeros((0, m)), np.zeros(0), np.zeros((n, 0)), gain, offset)
 
 
-def arm_offsets(error: ErrorConfig, seed: int) -> dict[str, np.ndarray]:
-    """What each arm's encoders read at the joints' true zero: side -> (6,) [rad]."""
-    draw = _rng(seed, 5).standard_normal((2, 6))
-    return {side: error.arm_offset * draw[k] for k, side in enumerate(SIDES)}
+def arm_offsets(error: ErrorConfig, seed: int, robot: Robot) -> dict[str, np.ndarray]:
+    """What each arm's encoders read at the joints' true zero: side -> (n,) [rad]."""
+    sizes = {side: len(arm) for side, arm in robot.arms.items()}
+    draws = np.split(_rng(seed, 5).standard_normal(sum(sizes.values())), [sizes[LEFT]])
+    return {side: error.arm_offset * draw for side, draw in zip(SIDES, draws)}
 
 
 def _rng(seed: int, stream: int) -> np.random.Generator:
@@ -162,7 +164,7 @@ class TruthSystem(PythonSystem):
         self._load = self.DeclareVectorInputPort("stem_load", 6)
         stem = plant.GetJointByName("stem", physics.valve)
         self._q, self._v = stem.position_start(), plant.num_positions() + stem.velocity_start()
-        self._base = [plant.GetJointByName(j, physics.robot).position_start() for j in BASE]
+        self._base = [plant.GetJointByName(j, physics.robot).position_start() for j in physics.base]
         self._bar_angle = valve.bar_angle
         self._X_WP = panel_pose(valve)
         X = plant.GetFrameByName("marker", physics.valve).GetFixedPoseInBodyFrame()
@@ -187,8 +189,11 @@ class TruthSystem(PythonSystem):
         output.SetFromVector(self._load.Eval(context))
 
 
-def true_head(head: StereoHead, error: ErrorConfig, seed: int) -> dict[str, Mount]:
-    """The head cameras as they really are: the calibration plus the errors drawn from the seed."""
+def true_head(head: StereoHead, error: ErrorConfig, seed: int, frame: str) -> dict[str, Mount]:
+    """The head cameras as they really are: the calibration plus the errors drawn from the seed.
+
+    frame: of the robot's model, where the left one is mounted.
+    """
     rng = _rng(seed, 4)
     mount = make(rotation(error.head_mount * rng.standard_normal(3)), np.zeros(3))
     wobble = error.head_rotation * rng.standard_normal(3)
@@ -196,8 +201,8 @@ def true_head(head: StereoHead, error: ErrorConfig, seed: int) -> dict[str, Moun
     # Both cameras are mounted on the left camera's frame: the right one at X_LR of the calibration, with errors.
     right = compose(mount, head.X_LR, make(rotation(wobble), np.zeros(3)))
     return {
-        "head_left": Mount(head.left, "head_left_camera", mount),
-        "head_right": Mount(head.right, "head_left_camera", right),
+        "head_left": Mount(head.left, frame, mount),
+        "head_right": Mount(head.right, frame, right),
     }
 
 
@@ -206,12 +211,14 @@ def wrist_lens(focal: float) -> Lens:
     return Lens(k_u=6e-7, k_v=6e-7, k_x=focal, k_y=focal, u_0=316.0, v_0=243.0)
 
 
-def make_mounts(head: StereoHead, simulation: SimulationConfig, seed: int) -> dict[str, Mount]:
-    """All four cameras of the simulated robot."""
+def make_mounts(
+    head: StereoHead, simulation: SimulationConfig, seed: int, frames: Mapping[str, str]
+) -> dict[str, Mount]:
+    """All four cameras of the simulated robot. frames: of its model, as robot.yaml's `cameras` names them."""
     wrist = wrist_lens(simulation.camera.wrist_focal)
     return {
-        **true_head(head, simulation.error, seed),
-        **{f"{side}_wrist": Mount(wrist, f"{side}_wrist_camera", np.eye(3, 4)) for side in SIDES},
+        **true_head(head, simulation.error, seed, frames["head_left"]),
+        **{f"{side}_wrist": Mount(wrist, frames[f"{side}_wrist"], np.eye(3, 4)) for side in SIDES},
     }
 
 
@@ -220,10 +227,10 @@ def rig_arguments(
     marker_size: tuple[float, float],
     head: StereoHead,
     seed: int,
-    robot: RobotDescription | None = None,
+    robot: RobotDescription,
 ) -> tuple[Any, ...]:
     """The arguments of CameraRig, or of CameraWorkers, for the station's cameras."""
-    mounts = make_mounts(head, simulation, seed)
+    mounts = make_mounts(head, simulation, seed, robot.cameras)
     return mounts, simulation.valve, marker_size, simulation.light, simulation.camera, seed, robot
 
 
@@ -249,24 +256,21 @@ def make_simulated_station(
     simulation: SimulationConfig,
     marker_size: tuple[float, float],
     head: StereoHead,
-    home: np.ndarray,
-    opening: float,
+    robot: Robot,
     seed: int,
     meshcat: Meshcat | None = None,
     workers: CameraWorkers | None = None,
-    robot: RobotDescription | None = None,
 ) -> Diagram:
-    """The station as a Diagram. simulation: resolved (no distributions left); home: both arms (12,) [rad].
+    """The station as a Diagram, the robot at home. simulation: resolved (no distributions left).
 
     workers: of `rig_arguments`, make the images; else they are made when they are read.
     """
     builder = DiagramBuilder()
     valve = simulation.valve
-    offsets = arm_offsets(simulation.error, seed)
-    start = dict(zip(BASE, start_pose(simulation.start, valve)))
-    for k, side in enumerate(SIDES):
-        start |= dict(zip(arm_joints(side), home[6 * k : 6 * k + 6] - offsets[side]))  # home is what the encoders read
-        start |= {f"{side}_finger_{finger}": opening / 2 for finger in (1, 2)}
+    offsets = arm_offsets(simulation.error, seed, robot)
+    arms = {side: arm.home - offsets[side] for side, arm in robot.arms.items()}  # home is what the encoders read
+    base = start_pose(simulation.start, valve)
+    start = robot.named(base=base, torso=robot.torso.home, arms=arms, opening=robot.opening)
     physics = builder.AddSystem(PlantSystem(valve, marker_size, start, offsets, robot))
     state, plant = physics.GetOutputPort("state"), physics.plant
     for name in COMMANDS:
@@ -281,19 +285,22 @@ def make_simulated_station(
         builder.Connect(physics.GetOutputPort("actuation") if what == "torque" else state, gain.get_input_port())
         builder.ExportOutput(gain.get_output_port(), port)
 
-    measure("torso.position_measured", TORSO, "position")
+    measure("torso.position_measured", robot.torso.names, "position")
     for side in SIDES:
-        measure(f"{side}_arm.position_measured", arm_joints(side), "position", offset=offsets[side])
-        measure(f"{side}_arm.velocity_measured", arm_joints(side), "velocity")
-        measure(f"{side}_arm.torque_measured", arm_joints(side), "torque")
-        measure(f"{side}_gripper.position_measured", [f"{side}_finger_1"], "position", 2.0)
-        measure(f"{side}_gripper.force_measured", [f"{side}_finger_1"], "torque", -1.0)
+        joints = robot.arms[side].names
+        measure(f"{side}_arm.position_measured", joints, "position", offset=offsets[side])
+        measure(f"{side}_arm.velocity_measured", joints, "velocity")
+        measure(f"{side}_arm.torque_measured", joints, "torque")
+        slope, zero = physics.opening[side]
+        finger = [robot.grippers[side].joint]
+        measure(f"{side}_gripper.position_measured", finger, "position", slope, np.array([zero]))
+        measure(f"{side}_gripper.force_measured", finger, "torque", -2.0 / slope)
 
-    base = builder.AddSystem(MatrixGain(np.vstack([_select(physics, BASE, what) for what in ("position", "velocity")])))
-    base.set_name("base_state")
-    builder.Connect(state, base.get_input_port())
+    moves = np.vstack([_select(physics, robot.base.names, what) for what in ("position", "velocity")])
+    moving = builder.AddNamedSystem("base_state", MatrixGain(moves))
+    builder.Connect(state, moving.get_input_port())
     odometry = builder.AddSystem(OdometrySystem(simulation.error, seed))
-    builder.Connect(base.get_output_port(), odometry.GetInputPort("base"))
+    builder.Connect(moving.get_output_port(), odometry.GetInputPort("base"))
     builder.ExportOutput(odometry.GetOutputPort("odometry"), "base.odometry")
 
     wrench = builder.AddSystem(WrenchSensorSystem(simulation.error, seed))
@@ -302,7 +309,11 @@ def make_simulated_station(
         builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
 
     camera = simulation.camera
-    images = CameraRig(*rig_arguments(simulation, marker_size, head, seed, robot)) if workers is None else workers
+    images = (
+        CameraRig(*rig_arguments(simulation, marker_size, head, seed, robot.description))
+        if workers is None
+        else workers
+    )
     positions = builder.AddSystem(MatrixGain(np.eye(plant.num_positions(), plant.num_multibody_states())))
     positions.set_name("positions")
     builder.Connect(state, positions.get_input_port())
@@ -322,11 +333,11 @@ def make_simulated_station(
         builder.ExportOutput(truth.GetOutputPort(name), TRUTH + name)
 
     if meshcat is not None:
-        view = _add_view(builder, positions.get_output_port(), valve, marker_size, meshcat, robot)
+        view = _add_view(builder, positions.get_output_port(), valve, marker_size, meshcat, robot.description)
         physics.view = view  # lives as long
     station = builder.Build()
     station.set_name("simulated")
-    check_contract(station)
+    check_contract(station, robot.groups)
     return station
 
 

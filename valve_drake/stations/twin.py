@@ -31,6 +31,7 @@ from valve_drake.messages import CameraFrame
 from valve_drake.motion import slew
 from valve_drake.ports import SLOT, TICK
 from valve_drake.processor import YIELDING, hurries
+from valve_drake.robot.groups import GROUPS
 from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rate import SECOND, CameraRate
 from valve_drake.stations.camera_rig import Capture
@@ -42,7 +43,6 @@ from valve_drake.stations.lcm_channels import (
     COMMANDS,
     CONTROLLER,
     IMAGES,
-    JOINTS,
     LOCKSTEP_TIME,
     MODE,
     PROTOCOL,
@@ -54,6 +54,7 @@ from valve_drake.stations.lcm_channels import (
     HardwareConfig,
     Values,
     WrongMessage,
+    check_sizes,
     image_message,
     read_mode,
     read_request,
@@ -63,14 +64,13 @@ from valve_drake.stations.lcm_channels import (
 from valve_drake.stations.reports import BadMessages, Lockstep, Stamps
 from valve_drake.stations.simulation_config import CameraConfig
 
-VECTORS = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and isinstance(spec.kind, int))
+VECTORS = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and not isinstance(spec.kind, type))
 FAULT_TIME = 0.5  # a refused command is reported as a fault for this long [s]
 REQUEST_AGE = 0.5  # cameras stop when the last request for them is older [s]
 FAR = 0.5  # a joint command farther from the measured position is refused [rad]
 FAST = (2.0, 3.0)  # a faster base twist is refused [m/s, rad/s]
 GRIP = (0.2, 200.0)  # a larger opening or force is refused [m, N]
-ARM_SPEED = (1.5, 1.5, 1.5, 2.5, 2.5, 2.5)
-SPEED = {"torso": (1.0, 2.0, 2.0), "left_arm": ARM_SPEED, "right_arm": ARM_SPEED}  # of the joints, at most [rad/s]
+FASTER = 1.25  # the robot's own limit on its joints' speed, as a multiple of what its description grants the program
 BEHIND = 0.1  # a joint whose limited motion is farther behind its command is reported [rad]
 BACK = 0.3  # speed of a joint that was stopped, back to its commands [rad/s]
 GONE = 3.0  # paced: a program that was silent for this long counts as gone; raise it for a slow one [s]
@@ -175,8 +175,10 @@ class LiveImages(CameraWorkers):
 class Guard:
     """The robot's own check of commands; it decides what the joints are sent."""
 
-    def __init__(self, start: Mapping[str, np.ndarray], age: float):
-        """start: port -> vector: what holds until the first command. age: of commands [s]."""
+    def __init__(self, start: Mapping[str, np.ndarray], age: float, speed: Mapping[str, np.ndarray]):
+        """start: port -> vector: what holds until the first command. age: of commands [s]. speed: of a group's joints,
+        at most [1/s]."""
+        self._speed = speed
         self._commanded = dict(start)
         self._targets = dict(start)  # what the joints were told last
         self._behind: set[str] = set()  # channels whose command is farther ahead than the joints' speed allows
@@ -219,7 +221,7 @@ class Guard:
                 target = self._targets[port + "command"] if stopped else measured[port + "measured"]
                 self._stopped.add(row.key)
             else:
-                target = _bounded(self._targets[port + "command"], goal, BACK if stopped else SPEED[row.device])
+                target = _bounded(self._targets[port + "command"], goal, BACK if stopped else self._speed[row.device])
                 if stopped and np.array_equal(target, goal):
                     self._stopped.discard(row.key)
                 behind = not stopped and np.max(np.abs(goal - target)) > BEHIND
@@ -235,7 +237,7 @@ class Guard:
         return words + [f"{key} refused: {p}" for key, (p, when) in self._refused.items() if time - when <= FAULT_TIME]
 
 
-def _bounded(value: np.ndarray, goal: np.ndarray, speed: float | tuple[float, ...]) -> np.ndarray:
+def _bounded(value: np.ndarray, goal: np.ndarray, speed: float | np.ndarray) -> np.ndarray:
     """One tick from `value` towards `goal`; a goal within reach is met to the bit."""
     step = np.asarray(speed) * TICK
     return np.where(np.abs(goal - value) <= step, goal, slew(value, goal, step))
@@ -247,7 +249,7 @@ def _problem(device: str, values: Values, measured: Values) -> str:
         return "not finite"
     if device == "base":
         return "" if np.all(np.abs(values["base.twist_command"]) <= FAST) else "too fast"
-    if device in JOINTS:
+    if device in GROUPS:
         far = np.max(np.abs(values[f"{device}.position_command"] - measured[f"{device}.position_measured"]))
         return "" if far <= FAR else f"{far:.2f} rad off the measured position"
     opening, force = (float(value[0]) for value in values.values())
@@ -278,7 +280,8 @@ class RobotClock:
 class Twin:
     """A simulated station behind LCM.
 
-    station: its inputs are the robot's joints, its outputs its sensors. start: what its inputs hold at first. images,
+    station: its inputs are the robot's joints, its outputs its sensors. start: what its inputs hold at first.
+    speed: of each group's joints, as the program may ask for [1/s]. images,
     rate: who makes the images of a paced twin, and how many.
     """
 
@@ -286,6 +289,7 @@ class Twin:
         self,
         station: Diagram,
         start: Mapping[str, np.ndarray],
+        speed: Mapping[str, np.ndarray],
         hardware: HardwareConfig,
         camera: CameraConfig,
         faults: Faults,
@@ -312,7 +316,8 @@ class Twin:
         newest = hardware.lockstep and not self._bus.lcm.get_lcm_url().startswith("memq")
         self._out = Wire(faults, self._bus.send, newest)
         self._in = Wire(faults, self._obey, newest)
-        self._guard = Guard(start, hardware.command_age)
+        self._guard = Guard(start, hardware.command_age, {group: FASTER * speed[group] for group in GROUPS})
+        self._sizes = {port: len(value) for port, value in start.items()}
         self._stamps = Stamps(quiet=hardware.command_age)
         self._bad = BadMessages(PATIENCE)
         self._requested: tuple[float, set[str]] = (-math.inf, set())
@@ -368,7 +373,7 @@ class Twin:
             elif key == MODE:
                 self.faults.enter(read_mode(message), self.time)
             elif row.read is not None:
-                self._command(key, row.read(message), getattr(message, row.stamp))
+                self._command(key, check_sizes(row.read(message), self._sizes), getattr(message, row.stamp))
             self._bad.good(row.device, self.time)
         except WrongMessage as error:
             self._bad.bad(row.device, f"{self._bus.name(key)}: {error}", self.time)
@@ -399,7 +404,7 @@ class Twin:
         if self.tick % round(self._hardware.robot_period / TICK) == 0 and not self.faults.silent("robot", time):
             state: dict[str, float] = {
                 "protocol": PROTOCOL,
-                **JOINTS,
+                **{group: float(len(self._measured[f"{group}.position_measured"])) for group in GROUPS},
                 "estop": self.faults.acts("estop", "robot", time),
             }
             words = [*self._guard.faults(time), *self._bad.faults(time), *self._too_slow()]
@@ -481,7 +486,7 @@ class Twin:
         time = self.time
         self._in.pass_on(time)
         targets = self._guard.targets(self._measured, self.faults.acts("estop", "robot", time), time)
-        for device in JOINTS:
+        for device in GROUPS:
             port = f"{device}.position_command"
             measured = self._measured[f"{device}.position_measured"]
             targets[port] = self.faults.stuck(device, time, targets[port], measured)

@@ -13,11 +13,11 @@ The first command of each joint is its measured position.
 
 import dataclasses as dc
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from valve_drake.checks import ConfigError, require
+from valve_drake.checks import ConfigError
 from valve_drake.config import Config, number, numbers
 from valve_drake.memory import changed
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, Health, ModeState, RobotState, SelectorReport
@@ -25,30 +25,11 @@ from valve_drake.motion import follow
 from valve_drake.robot.kinematics import Joints
 from valve_drake.task.modes import HOLD, OPEN, TABLE
 
-# Groups of joints commanded by position, in this order in every vector of this file.
-JOINTS = {
-    "torso": slice(0, 3),
-    "left_arm": slice(3, 9),
-    "right_arm": slice(9, 15),
-    "left_gripper": slice(15, 16),
-    "right_gripper": slice(16, 17),
-}
-GROUPS = ("base", *JOINTS)
 GRIPPERS = ("left_gripper", "right_gripper")
 ARMS = ("left_arm", "right_arm")
+JOINTS = ("torso", *ARMS, *GRIPPERS)  # commanded by position, in this order in every vector of this file
+GROUPS = ("base", *JOINTS)
 FOLLOWERS = ("base", "torso", *ARMS)  # that are where they are commanded; fingers stop at what they hold
-
-PORTS = {
-    "base.twist_command": 2,
-    "torso.position_command": 3,
-    "left_arm.position_command": 6,
-    "right_arm.position_command": 6,
-    "left_gripper.position_command": 1,
-    "left_gripper.force_limit": 1,
-    "right_gripper.position_command": 1,
-    "right_gripper.force_limit": 1,
-}
-
 
 SOURCE: dict[str, dict[str, str]] = {
     mode: {group: row.source(group) for group in GROUPS} for mode, row in TABLE.items()
@@ -57,21 +38,17 @@ SOURCE: dict[str, dict[str, str]] = {
 
 @dc.dataclass
 class CommandSelectorConfig(Config):
-    """Scenario key `command_selector`. Lists are per joint, in the order of the station's ports.
+    """Scenario key `command_selector`. Positions and speeds of the joints are bounded by the robot (robot.yaml).
 
-    Upper bounds are the robot's own limits (models/robot/robot.sdf), and the times and forces of docs/hardware.md: a
-    scenario can be stricter than what is promised there, and never laxer.
+    Upper bounds of times and forces are those of docs/hardware.md: a scenario can be stricter than what is promised
+    there, and never laxer.
     """
 
     KEY = "command_selector"
     base_speed: list[float] = numbers([0.8, 1.2], 0.05, (1.5, 2.0), "forward, yaw rate [m/s, rad/s]")
     base_acceleration: list[float] = numbers([0.8, 2.0], 0.1, (1.5, 4.0), "forward, yaw rate [m/s^2, rad/s^2]")
-    torso_low: list[float] = numbers([-0.6, -0.5, -1.6], (-0.6, -0.5, -1.6), 0.0, "waist, neck pitch, neck yaw [rad]")
-    torso_high: list[float] = numbers([0.6, 1.1, 1.6], 0.0, (0.6, 1.1, 1.6), "waist, neck pitch, neck yaw [rad]")
-    torso_speed: list[float] = numbers([0.8, 1.6, 1.6], 0.05, (1.5, 3.0, 3.0), "[rad/s]")
-    torso_acceleration: list[float] = numbers([6.0, 6.0, 6.0], 0.5, 20.0, "[rad/s^2]")
-    arm_speed: list[float] = numbers([1.2, 1.2, 1.2, 2.0, 2.0, 2.0], 0.05, (2.5, 2.5, 2.5, 4.0, 4.0, 4.0), "[rad/s]")
-    arm_acceleration: list[float] = numbers([8.0] * 6, 0.5, 20.0, "[rad/s^2]")
+    acceleration_torso: float = number(6.0, 0.5, 20.0, "of lift, waist, tilt and pan [m/s^2, rad/s^2]")
+    acceleration_arm: float = number(8.0, 0.5, 20.0, "[rad/s^2]")
     gripper_high: float = number(0.09, 0.03, 0.09, "opening; the lower limit is 0 [m]")
     gripper_speed: float = number(0.1, 0.01, 0.2, "[m/s]")
     gripper_acceleration: float = number(2.0, 0.1, 10.0, "[m/s^2]")
@@ -85,35 +62,39 @@ class CommandSelectorConfig(Config):
     follow_speed: float = number(0.25, 0.02, 0.25, "of the base off its command [m/s, rad/s]")
     follow_time: float = number(0.25, 0.03, 0.25, "for so long: the group does not follow [s]")
 
-    def relations(self, key: str) -> None:
-        below = all(low < high for low, high in zip(self.torso_low, self.torso_high))
-        require(below, f"{key}.torso_low", f"below torso_high, {self.torso_high}", self.torso_low)
-
 
 @dc.dataclass(frozen=True, eq=False)
 class Bounds:
-    """Limits of all joints in the order of JOINTS."""
+    """Limits of all n joints in the order of JOINTS, and where each group stands among them."""
 
-    low: np.ndarray  # (17,) [rad or m]
-    high: np.ndarray  # (17,)
-    speed: np.ndarray  # (17,) [1/s]
-    acceleration: np.ndarray  # (17,) [1/s^2]
+    parts: Mapping[str, slice]  # by group
+    low: np.ndarray  # (n,) [rad or m]
+    high: np.ndarray  # (n,)
+    speed: np.ndarray  # (n,) [1/s]
+    acceleration: np.ndarray  # (n,) [1/s^2]
     base_speed: np.ndarray  # (2,)
     base_acceleration: np.ndarray  # (2,)
 
 
-def bounds(config: CommandSelectorConfig, arms: Mapping[str, Joints]) -> Bounds:
-    """arms: of the robot, by side."""
+def bounds(config: CommandSelectorConfig, torso: Joints, arms: Mapping[str, Joints]) -> Bounds:
+    """torso, arms: of the robot, these by side."""
     c = config
-
-    def joints(torso: list[float], arms: Sequence[Sequence[float]], gripper: float) -> np.ndarray:
-        return np.array([*torso, *(value for arm in arms for value in arm), gripper, gripper])
-
+    sizes = {"torso": len(torso)} | {f"{side}_arm": len(arms[side]) for side in SIDES} | dict.fromkeys(GRIPPERS, 1)
+    ends = np.cumsum([sizes[group] for group in JOINTS]).tolist()
+    parts = {group: slice(end - sizes[group], end) for group, end in zip(JOINTS, ends)}
+    joints = (torso, *(arms[side] for side in SIDES))
+    accelerations = (c.acceleration_torso, c.acceleration_arm, c.acceleration_arm)
     return Bounds(
-        low=joints(c.torso_low, [arms[side].low.tolist() for side in SIDES], 0.0),
-        high=joints(c.torso_high, [arms[side].high.tolist() for side in SIDES], c.gripper_high),
-        speed=joints(c.torso_speed, [c.arm_speed] * 2, c.gripper_speed),
-        acceleration=joints(c.torso_acceleration, [c.arm_acceleration] * 2, c.gripper_acceleration),
+        parts=parts,
+        low=np.concatenate([*(group.low for group in joints), np.zeros(2)]),
+        high=np.concatenate([*(group.high for group in joints), np.full(2, c.gripper_high)]),
+        speed=np.concatenate([*(group.speed for group in joints), np.full(2, c.gripper_speed)]),
+        acceleration=np.concatenate(
+            [
+                *(np.full(len(group), most) for group, most in zip(joints, accelerations)),
+                np.full(2, c.gripper_acceleration),
+            ]
+        ),
         base_speed=np.array(c.base_speed),
         base_acceleration=np.array(c.base_acceleration),
     )
@@ -124,9 +105,9 @@ class Memory:
     """What was commanded last."""
 
     bounds: Bounds
-    position: np.ndarray  # (17,) command [rad or m]
-    velocity: np.ndarray  # (17,) of the command [1/s]
-    target: np.ndarray  # (17,) what the sources asked for, within the position limits
+    position: np.ndarray  # (n,) command [rad or m]
+    velocity: np.ndarray  # (n,) of the command [1/s]
+    target: np.ndarray  # (n,) what the sources asked for, within the position limits
     force: np.ndarray  # (2,) force limits of the grippers [N]
     twist: np.ndarray  # (2,) of the base
     started: bool = False  # the measured position was taken over
@@ -136,21 +117,31 @@ class Memory:
     behind: tuple[int, ...] = (0,) * len(FOLLOWERS)  # ticks in a row behind the command
 
 
-def start(config: CommandSelectorConfig, initial: Mapping[str, np.ndarray], arms: Mapping[str, Joints]) -> Memory:
+def ports(bounds: Bounds) -> dict[str, int]:
+    """The station's command ports: name -> size."""
+    out = {"base.twist_command": 2}
+    out |= {f"{group}.position_command": part.stop - part.start for group, part in bounds.parts.items()}
+    return out | {f"{group}.force_limit": 1 for group in GRIPPERS}
+
+
+def start(
+    config: CommandSelectorConfig, initial: Mapping[str, np.ndarray], torso: Joints, arms: Mapping[str, Joints]
+) -> Memory:
     """Memory before the first step, holding `initial` (port name -> vector). Raises ConfigError if one does not fit."""
-    for port, size in PORTS.items():
+    limits = bounds(config, torso, arms)
+    for port, size in ports(limits).items():
         if port not in initial or np.shape(initial[port]) != (size,) or not np.all(np.isfinite(initial[port])):
             raise ConfigError(f"command_selector: initial {port} must be {size} finite numbers")
     position = np.concatenate([np.asarray(initial[f"{group}.position_command"], float) for group in JOINTS])
     force = np.concatenate([np.asarray(initial[f"{group}.force_limit"], float) for group in GRIPPERS])
     twist = np.array(initial["base.twist_command"], float)
-    return Memory(bounds(config, arms), position, np.zeros(17), position, force, twist)
+    return Memory(limits, position, np.zeros(len(position)), position, force, twist)
 
 
 def outputs(memory: Memory) -> dict[str, np.ndarray]:
     """The station's command ports: name -> vector."""
     out = {"base.twist_command": memory.twist}
-    for group, part in JOINTS.items():
+    for group, part in memory.bounds.parts.items():
         out[f"{group}.position_command"] = memory.position[part]
     for k, group in enumerate(GRIPPERS):
         out[f"{group}.force_limit"] = memory.force[k : k + 1]
@@ -231,7 +222,7 @@ def step(
 
 
 def measured(state: RobotState) -> np.ndarray:
-    """Measured joint positions in the order of JOINTS -> (17,)."""
+    """Measured joint positions in the order of JOINTS -> (n,)."""
     return np.concatenate([state.torso, state.left_arm, state.right_arm, [state.left_gripper, state.right_gripper]])
 
 
@@ -300,10 +291,10 @@ def _base(m: Memory, wanted: np.ndarray | None, dt: float) -> tuple[np.ndarray, 
 def _joints(
     m: Memory, wanted: dict[str, np.ndarray], dt: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """Moves every joint one step -> position, velocity and target (17,), what was limited."""
+    """Moves every joint one step -> position, velocity and target (n,), what was limited."""
     b = m.bounds
     asked: list[float | None] = [None] * len(m.position)  # None: held
-    for group, part in JOINTS.items():
+    for group, part in b.parts.items():
         if group in wanted:
             asked[part] = wanted[group].tolist()[:1] if group in GRIPPERS else wanted[group].tolist()
     now = m.position.tolist()
@@ -348,7 +339,7 @@ def _limited(
 ) -> list[str]:
     """What of the commanded groups is not as it was asked."""
     limited: list[str] = []
-    for group, part in JOINTS.items():
+    for group, part in b.parts.items():
         if group not in wanted or asked[part] == target[part] == position[part]:  # nearly always
             continue
         if asked[part] != target[part]:
@@ -388,7 +379,7 @@ def _follow(
     commanded = m.position.tolist()
     near = {"base": _close(state.odometry.tolist()[3:], m.twist.tolist(), config.follow_speed)}
     for group, found in zip(("torso", *ARMS), (state.torso, state.left_arm, state.right_arm)):
-        near[group] = _close(found.tolist(), commanded[JOINTS[group]], config.follow_error)
+        near[group] = _close(found.tolist(), commanded[m.bounds.parts[group]], config.follow_error)
     behind = tuple(0 if near[group] else count + 1 for group, count in zip(FOLLOWERS, m.behind))
     return behind, tuple(group for group, count in zip(FOLLOWERS, behind) if count * dt > config.follow_time)
 

@@ -8,11 +8,11 @@ from valve_drake.messages import Command, Health, ModeState, RobotState, Selecto
 from valve_drake.ports import Block, Inputs, Outputs
 from valve_drake.robot.kinematics import Joints
 from valve_drake.supervisor.command_selector import (
-    PORTS,
     CommandSelectorConfig,
     Memory,
     changes,
     outputs,
+    ports,
     start,
     step,
 )
@@ -40,27 +40,28 @@ class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
     health                           in   Health          of the station
     (every behaviour)                in   Command         one port each, named after it
     base.twist_command               out  vector(2)       forward [m/s], yaw rate [rad/s]
-    torso.position_command           out  vector(3)       [rad]
-    {side}_arm.position_command      out  vector(6)       [rad]
+    torso.position_command           out  vector          [m, rad]
+    {side}_arm.position_command      out  vector          [rad]
     {side}_gripper.position_command  out  vector(1)       opening [m]
     {side}_gripper.force_limit       out  vector(1)       [N]
     report                           out  SelectorReport
 
-    initial: what the output vectors hold until the first robot state, by port name. arms: of the robot, by side.
+    initial: what the output vectors hold until the first robot state, by port name. torso, arms: of the
+    robot, these by side.
     """
-
-    OUTPUTS = PORTS | {"report": SelectorReport}
 
     def __init__(
         self,
         config: CommandSelectorConfig,
         initial: Mapping[str, np.ndarray],
+        torso: Joints,
         arms: Mapping[str, Joints],
         name: str = "command_selector",
     ):
         config.check()
         self.config = config
-        self._start = start(config, initial, arms)
+        self._start = start(config, initial, torso, arms)
+        self.OUTPUTS = ports(self._start.bounds) | {"report": SelectorReport}
         super().__init__(name, slot=2)
 
     def initial(self) -> Memory:
