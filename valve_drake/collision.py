@@ -1,7 +1,7 @@
 """Do the arms touch anything? A model of robot, valve and panel for planning, apart from the simulated plant."""
 
 import numpy as np
-from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, QueryObject, SignedDistancePair
+from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, QueryObject, SignedDistancePair
 from pydrake.math import RigidTransform, RotationMatrix
 
 from valve_drake.frames import compose, make
@@ -15,6 +15,7 @@ FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the val
 class CollisionModel:
     """Robot at the base's origin with lift, waist and head at home, and a valve that can be put anywhere.
 
+    ignored: pairs of links that may touch, since they do at home (robot.yaml's `collision.ignore`).
     clearance: least distance that counts as free; a larger one forbids poses near the valve [m]; None: the robot's.
     opening: of both grippers [m]; None: the robot's.
     """
@@ -28,11 +29,20 @@ class CollisionModel:
         self._panel_depth = marker.panel_depth
         self._arms = robot.slots([name for side in SIDES for name in robot.arms[side].names])
         self._rest = robot.rest(robot.opening if opening is None else opening)
+        self.ignored: set[tuple[str, str]] = set()
         if robot.description.collision.ignore:
             self._ignore(self._near(None, robot.home))
 
     def _ignore(self, pairs: list[SignedDistancePair]) -> None:
         """These pairs of shapes may touch from now on."""
+        inspector = self._scene_graph.model_inspector()
+
+        def link(shape: GeometryId) -> str:
+            body = self._plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
+            name: str = body.name()
+            return name
+
+        self.ignored = {(link(pair.id_A), link(pair.id_B)) for pair in pairs}
         filters = self._scene_graph.collision_filter_manager(self._scene_graph.GetMyMutableContextFromRoot(self._root))
         for pair in pairs:
             both = GeometrySet(pair.id_A), GeometrySet(pair.id_B)

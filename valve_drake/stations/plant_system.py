@@ -33,6 +33,7 @@ from valve_drake.robot.groups import GROUPS
 from valve_drake.robot.robot import Gripper, Robot
 from valve_drake.stations.contract import CONTRACT, vectors
 from valve_drake.stations.scene import add_scene
+from valve_drake.stations.servos import add_servos, ignore_touching
 from valve_drake.stations.simulation_config import ValveConfig
 
 STRAIGHT = 2e-4  # an opening may leave the straight line over its joint by so much [m]
@@ -104,7 +105,9 @@ class PlantSystem(PythonSystem):
         self.scene_graph.set_name("scene_graph")
         scene = add_scene(self.plant, valve, marker_size, robot.description)
         self.robot, self.valve = scene.robot, scene.valve
+        add_servos(self.plant, self.robot, robot)
         self.plant.Finalize()
+        ignore_touching(self.plant, self.scene_graph, self.robot, robot)
         _leave_out_looks(self.plant, self.scene_graph)
         for name, value in start.items():
             self.plant.GetJointByName(name, self.robot).set_default_positions([value])

@@ -1,0 +1,47 @@
+"""What a robot's model file leaves to the simulation: servos of its joints, and which of its shapes may touch."""
+
+from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
+
+from valve_drake.collision import CollisionModel
+from valve_drake.messages import SIDES
+from valve_drake.perception.marker import Marker
+from valve_drake.robot.robot import Robot
+
+FULL = 0.03  # a servo without gains in the file gives its full effort this far off; raise it if it shakes [rad, m]
+DAMPING = 0.03  # of such a servo, as a share of its stiffness; raise it if it swings [s]
+
+
+def add_servos(plant: MultibodyPlant, model: ModelInstanceIndex, robot: Robot) -> None:
+    """Gains for all of the robot's actuators: robot.yaml's stiffness, else those of the file, else by the effort.
+
+    For a plant that is not finalized.
+    """
+    wanted = {
+        joint: stiffness
+        for side in SIDES
+        for joint, stiffness in zip(robot.arms[side].names, robot.description.arm(side).stiffness)
+    }
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        if actuator.model_instance() != model:
+            continue
+        stiffness = wanted.get(actuator.joint().name())
+        if stiffness is None and actuator.has_controller():
+            continue
+        stiffness = actuator.effort_limit() / FULL if stiffness is None else stiffness
+        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=DAMPING * stiffness))
+
+
+def ignore_touching(plant: MultibodyPlant, scene_graph: SceneGraph, model: ModelInstanceIndex, robot: Robot) -> None:
+    """Links that touch while the robot is at home do not collide, where robot.yaml says so (`collision.ignore`).
+
+    For a plant that is finalized.
+    """
+    if not robot.description.collision.ignore:
+        return
+    filters = scene_graph.collision_filter_manager()
+    for pair in CollisionModel(robot, Marker()).ignored:
+        a, b = (GeometrySet(plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name, model))) for name in pair)
+        filters.Apply(CollisionFilterDeclaration().ExcludeBetween(a, b))
