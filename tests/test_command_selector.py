@@ -614,7 +614,7 @@ def test_whoever_commands_a_group_in_a_mode_is_awake_in_it():
 
 
 def test_ports_whose_value_stays_are_not_written_again():
-    before = start(CONFIG, INITIAL, ROBOT.arms)
+    before = start(CONFIG, INITIAL, ROBOT.torso, ROBOT.arms)
     assert changes(before, before) == {}
-    moved = dc.replace(before, position=before.position + np.eye(17)[4], twist=-before.twist)
+    moved = dc.replace(before, position=before.position + np.eye(len(before.position))[4], twist=-before.twist)
     assert set(changes(moved, before)) == {"left_arm.position_command", "base.twist_command"}  # -0.0 is not 0.0

@@ -28,7 +28,6 @@ from valve_drake import profiling
 from valve_drake.checks import require
 from valve_drake.messages import SIDES
 from valve_drake.ports import SLOT, TICK, PythonSystem
-from valve_drake.robot.description import RobotDescription
 from valve_drake.robot.groups import GROUPS
 from valve_drake.robot.robot import Gripper, Robot
 from valve_drake.stations.contract import CONTRACT, vectors
