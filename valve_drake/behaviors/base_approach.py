@@ -86,7 +86,7 @@ class BaseApproachConfig(Config):
     attempts: int = number(4, 1, 20, "at driving in straight, before it fails")
     stance_patience: float = number(5.0, 0.5, 60.0, "waits so long for a first stance [s]")
     retreat_distance: float = number(0.5, 0.05, 2.0, "straight back from the stance [m]")
-    retreat_speed: float = number(0.2, 0.02, 0.5, "[m/s]")
+    retreat_speed: float = number(0.3, 0.02, 0.5, "[m/s]")
 
     def relations(self, key: str) -> None:
         below = self.rough_stop < self.rough_distance
@@ -219,7 +219,7 @@ def _rough(
     if distance < config.rough_distance and _still(config, state):
         return _end(m, "succeeded", detail=m.detail) if _sure(config, m.marker) else (m, np.zeros(2))
     forward = 0.0
-    if abs(bearing) < config.facing:
+    if abs(bearing) < config.facing and distance >= config.rough_distance:  # nearer it comes to rest where it is
         forward = _drive(config, max(distance - config.rough_stop, 0.0), config.speed, dt) * np.cos(bearing)
     rate = _turn(config, bearing, dt) if distance > config.rough_stop else 0.0
     return m, np.array([forward, rate])
