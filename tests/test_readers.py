@@ -119,7 +119,8 @@ def test_reruns_recording_has_every_message_and_all_that_the_blueprint_shows(log
 
 
 def test_a_log_that_was_cut_off_has_its_recording_too(log, rerun, tmp_path, capsys):
-    (tmp_path / "cut.mcap").write_bytes(log.path.read_bytes()[:2_000_000])
+    whole = log.path.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 4])
     assert rerun_view.main([str(tmp_path / "cut.mcap")]) == 3
     assert "breaks off" in capsys.readouterr().out
     rows, _ = rows_of(rerun("rrd", "print", tmp_path / "cut.rrd").stdout)
