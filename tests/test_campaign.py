@@ -166,7 +166,7 @@ with executors.executor("local", 2) as pool:
 
 
 def test_killed_five_times_and_resumed_no_run_is_lost_or_counted_twice(tmp_path, fake, monkeypatch):
-    monkeypatch.setenv("TAKES", "0.3")
+    monkeypatch.setenv("TAKES", "0.1")
     out = tmp_path / "out"
     script = KILLED.format(program=str(tmp_path / "fake.py"), out=str(out))
     counts = []
@@ -268,7 +268,7 @@ def test_the_command_prints_the_numbers_and_writes_page_and_table(tmp_path, fake
 
 def test_compare_pairs_the_seeds_of_two_campaigns(tmp_path, fake):
     run(wanted(tmp_path / "a", 10, 1))
-    run(wanted(tmp_path / "b", 10, 5))
+    run(wanted(tmp_path / "b", 8, 5))
     found = comparison.compare(tmp_path / "a", tmp_path / "b")
     assert (found["pairs"], found["turned_a"], found["turned_b"], found["better"], found["worse"]) == (6, 5, 5, 0, 0)
     assert found["differences"]["turn_peak_hand_force_N"]["mean"] == 0.0
