@@ -260,7 +260,8 @@ def test_the_command_prints_the_numbers_and_writes_page_and_table(tmp_path, fake
     numbers = json.loads(capsys.readouterr().out)
     assert (numbers["runs"], numbers["turned"]) == (3, 2)
     page = (tmp_path / "out/report.html").read_text()
-    assert "2 of 3 turned" in page and "--seed 7" in page and "simulated-7.mcap" in page
+    assert "2 of 3 turned" in page and "<b>0 + 0</b>" in page and ", of 3</span>" in page
+    assert "--seed 7" in page and "simulated-7.mcap" in page
     rows = (tmp_path / "out/runs.csv").read_text().splitlines()
     assert len(rows) == 4 and rows[0].startswith("scenario,seed,outcome,verdict,mode,reason,")
     assert cli.main(["runs", "out", "--json"]) == 0
