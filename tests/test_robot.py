@@ -1,6 +1,9 @@
 """robot.yaml and the robot that is made of it: names, limits, loads, gripper, and one line for whatever is wrong."""
 
+import ast
 import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -362,3 +365,30 @@ def test_no_key_of_our_file_is_left_at_a_default_by_mistake():
     given = yaml_file.read(OURS)
     assert {"model", "base", "gaze", "arms", "grippers", "opening", "cameras"} <= set(given)
     assert len(OURS.read_text().splitlines()) < 80
+
+
+def literals(path: Path) -> set[str]:
+    """All texts of a module but its docstrings; of an f-string, the parts between its fields."""
+    tree = ast.parse(path.read_text())
+    documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    texts = (n for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str))
+    return {node.value for node in texts if id(node) not in documents}
+
+
+def test_no_joint_or_frame_of_our_robot_is_named_in_the_program():
+    """But for what robot.yaml's schema asks for (left_grip, right_grip) and the base joints that a model gets."""
+    model = ElementTree.parse(description.find(description.OURS).with_name("robot.sdf"))
+    names = {element.get("name") for kind in ("joint", "frame") for element in model.iter(kind)}
+    devices = {f"{side}_wrist_sensor" for side in SIDES}  # of the station, whatever the robot calls them
+    keys = {"waist", "base_x", "base_y", "base_yaw", "B", "H", *(f"{side}_grip" for side in SIDES)}
+    ours = names - devices - keys
+    assert len(ours) > 20
+    parts = re.compile(r"_arm_\d|_arm_$|_finger_|_wrist_camera|head_(left|right)_camera|neck_(yaw|pitch)$")
+    root = Path(description.__file__).parent.parent
+    found = [
+        f"{path.relative_to(root)}: {text!r}"
+        for path in sorted(root.rglob("*.py"))
+        for text in literals(path)
+        if text in ours or (parts.search(text) and "\n" not in text and " " not in text)
+    ]
+    assert found == []
