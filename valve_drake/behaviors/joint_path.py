@@ -1,7 +1,7 @@
 """Collision-free joint paths for both arms together, and their timing.
 
 `find_path` tries the straight line in joint space, then lines through given via poses, then RRT-Connect with
-short-cuts; every sample is checked by the caller's `is_free(q (12,)) -> bool` (left arm, right arm).
+short-cuts; every sample is checked by the caller's `is_free(q (n,)) -> bool` (left arm, right arm).
 """
 
 import dataclasses as dc
@@ -18,7 +18,7 @@ LEAVE = 0.06  # poses this near to the start are not checked: the robot is there
 class Path:
     """Way points of both arms, with a stop at each: trapezoidal speed along every leg.
 
-    points: (N, 12) [rad]; start: when it begins [s].
+    points: (N, n) [rad]; start: when it begins [s].
     """
 
     points: np.ndarray
@@ -38,7 +38,7 @@ class Path:
         return self.start + float(np.sum(self.durations()))
 
     def sample(self, time: float) -> np.ndarray:
-        """Joint angles at `time` -> (12,)."""
+        """Joint angles at `time` -> (n,)."""
         left = max(time - self.start, 0.0)  # a leg without length takes no time
         for k, duration in enumerate(self.durations()):
             if left < duration:
@@ -69,7 +69,7 @@ def line_is_free(a: np.ndarray, b: np.ndarray, is_free: Free) -> bool:
 def find_path(
     start: np.ndarray, goal: np.ndarray, vias: Sequence[np.ndarray], is_free: Free, *, tries: int = 400
 ) -> np.ndarray | None:
-    """Way points (N, 12) from start to goal, or None. The start need not be free: the robot is there."""
+    """Way points (N, n) from start to goal, or None. The start need not be free: the robot is there."""
     if not is_free(goal):
         return None
 

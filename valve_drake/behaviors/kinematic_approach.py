@@ -14,6 +14,7 @@ Frames: frames.py. The base stands still from measure to verify.
 
 import copy
 import dataclasses as dc
+from typing import NamedTuple
 
 import numpy as np
 
@@ -91,6 +92,16 @@ class Memory:
     status: Status = Status()
 
 
+class Inputs(NamedTuple):
+    """What the block reads in a tick."""
+
+    state: RobotState
+    mode: ModeState
+    estimate: RectangleEstimate
+    marks: HandleMarks
+    turn: TurnState
+
+
 # Modes in which another block moves the arms; on return the commands start from the measured joints.
 NOT_OWNED = tuple(mode for mode, row in TABLE.items() if row.hands != "kinematic_approach")
 OFF_HOME = 0.005  # of lift and waist while the hands work; it displaces them by as much a meter away [rad, m]
@@ -145,7 +156,7 @@ class KinematicApproach:
             Mode.VERIFY: self._verify,
         }
         if mode.mode in run:
-            m = run[Mode(mode.mode)](time, m, state, mode, estimate, marks, turn)
+            m = run[Mode(mode.mode)](time, m, Inputs(state, mode, estimate, marks, turn))
         else:
             if mode.mode == Mode.SEARCH:
                 m = changed(m, stance=Stance(), stance_looks=())
@@ -243,36 +254,28 @@ class KinematicApproach:
             m = changed(m, looks=(*m.looks, estimate), seen=estimate.sequence)
         return m
 
-    def _measure(
-        self,
-        time: float,
-        m: Memory,
-        state: RobotState,
-        mode: ModeState,
-        estimate: RectangleEstimate,
-        marks: HandleMarks,
-        turn: TurnState,
-    ) -> Memory:
+    def _measure(self, time: float, m: Memory, inputs: Inputs) -> Memory:
         if m.phase == "start":
             m = self._status(changed(m, phase="look", since=time), time, "running")
         if m.phase != "look":
             return m
-        m = self._look(time, m, estimate)
+        m = self._look(time, m, inputs.estimate)
         if len(m.looks) < self.config.frames:
             return m
         fused = fuse(m.looks)
         if not fused.found:
             return self._status(changed(m, phase="end"), time, "failed", Verdict.MARKER_LOST, fused.reason)
         posture = self.robot.posture
-        off = np.abs(state.torso[: len(posture)] - posture.home)
+        off = np.abs(inputs.state.torso[: len(posture)] - posture.home)
         if len(posture) and not np.max(off) <= OFF_HOME:
             k = int(np.argmax(off))
-            detail = f"{posture.names[k]} stands at {state.torso[k]:.3f}, the arms reach from {posture.home[k]:.3f}"
+            stands = inputs.state.torso[k]
+            detail = f"{posture.names[k]} stands at {stands:.3f}, the arms reach from {posture.home[k]:.3f}"
             return self._status(changed(m, phase="end"), time, "failed", Verdict.FAULT, detail)
-        X_BV = compose(inverse(planar(*state.odometry[:3])), fused.X_OV)
-        arc = self.stances.best_arc(X_BV, mode.turn_angle)
+        X_BV = compose(inverse(planar(*inputs.state.odometry[:3])), fused.X_OV)
+        arc = self.stances.best_arc(X_BV, inputs.mode.turn_angle)
         if arc.margin < self.stances.config.margin_min:
-            m = self._find_stance(time, changed(m, stance_looks=m.looks, seen=-1), mode, estimate)
+            m = self._find_stance(time, changed(m, stance_looks=m.looks, seen=-1), inputs.mode, inputs.estimate)
             detail = f"arm margin {arc.margin:.2f} from here"
             return self._status(
                 changed(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, detail, cause=Cause.STANCE
@@ -293,16 +296,7 @@ class KinematicApproach:
         return self._status(m, time, "succeeded", detail=detail)
 
     # ------------------------------------------------------------ reach
-    def _reach(
-        self,
-        time: float,
-        m: Memory,
-        state: RobotState,
-        mode: ModeState,
-        estimate: RectangleEstimate,
-        marks: HandleMarks,
-        turn: TurnState,
-    ) -> Memory:
+    def _reach(self, time: float, m: Memory, inputs: Inputs) -> Memory:
         plan = m.plan
         if m.phase == "start":
             m = self._status(m, time, "running")
@@ -316,7 +310,7 @@ class KinematicApproach:
                 return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path to the handles")
         if m.phase == "moving":
             arrived = m.path is None or time >= m.path.end()
-            near = all(self._mark_ratio(marks, side) >= self.config.mark_ratio for side in SIDES)
+            near = all(self._mark_ratio(inputs.marks, side) >= self.config.mark_ratio for side in SIDES)
             if arrived or near:
                 why = "at the stand-off" if arrived else "marks are large enough"
                 m = changed(m, phase="rest", since=time, path=m.path if arrived else None)
@@ -340,20 +334,11 @@ class KinematicApproach:
         return np.concatenate(reached) if len(reached) == len(arms) else None
 
     # ------------------------------------------------------------ fold
-    def _fold(
-        self,
-        time: float,
-        m: Memory,
-        state: RobotState,
-        mode: ModeState,
-        estimate: RectangleEstimate,
-        marks: HandleMarks,
-        turn: TurnState,
-    ) -> Memory:
+    def _fold(self, time: float, m: Memory, inputs: Inputs) -> Memory:
         if m.phase == "start":
             m = self._status(m, time, "running")
         if m.phase in ("start", "moving"):
-            m = self._homing(time, m, turned(m.plan.X_BV, turn.angle))
+            m = self._homing(time, m, turned(m.plan.X_BV, inputs.turn.angle))
             if m.phase == "blocked":
                 return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path home")
         if m.phase == "home":
@@ -361,33 +346,25 @@ class KinematicApproach:
         return m
 
     # ------------------------------------------------------------ verify
-    def _verify(
-        self,
-        time: float,
-        m: Memory,
-        state: RobotState,
-        mode: ModeState,
-        estimate: RectangleEstimate,
-        marks: HandleMarks,
-        turn: TurnState,
-    ) -> Memory:
+    def _verify(self, time: float, m: Memory, inputs: Inputs) -> Memory:
         if m.phase == "start":
             m = self._status(changed(m, phase="look", since=time), time, "running")
         if m.phase != "look":
             return m
-        m = self._look(time, m, estimate)
+        m = self._look(time, m, inputs.estimate)
         newest = m.looks[-1].time if m.looks else 0.0
         m = changed(m, looks=tuple(look for look in m.looks if look.time >= newest - self.config.still_time))
         drift = self._drift(m.looks)
         if drift is None or abs(drift) > self.config.still_rate:
-            return self._unverified(m, time, mode, turn, drift) if time - m.since > self.config.look_time else m
+            patient = time - m.since <= self.config.look_time
+            return m if patient else self._unverified(m, time, inputs.mode, inputs.turn, drift)
         fused = fuse(m.looks)
         m = changed(m, phase="end")
         if not fused.found or m.X_OV0 is None:
             return self._status(m, time, "failed", Verdict.MARKER_LOST, fused.reason)
-        seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, turn.angle)
-        missing = abs(mode.turn_angle - seen)
-        detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(mode.turn_angle):.2f} deg"
+        seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, inputs.turn.angle)
+        missing = abs(inputs.mode.turn_angle - seen)
+        detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(inputs.mode.turn_angle):.2f} deg"
         state_now = "succeeded" if missing <= self.config.angle_tolerance else "failed"
         verdict = Verdict.NONE if state_now == "succeeded" else Verdict.SLIP
         return changed(m, status=self._seen(time, m, state_now, verdict, detail, seen))

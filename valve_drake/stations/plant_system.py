@@ -50,7 +50,7 @@ class Stepped(NamedTuple):
     x: np.ndarray  # positions and velocities (nx,)
     base: np.ndarray  # set point x, y, heading (3,) [m, rad]
     actuation: np.ndarray  # of the robot's actuators during the last step (n,) [N m, N]
-    loads: list[np.ndarray]  # on the joints LOADED during the last step (6,) [N m, N]
+    loads: list[np.ndarray]  # on the wrist sensors and the stem during the last step (6,) [N m, N]
 
 
 class PlantSystem(PythonSystem):
