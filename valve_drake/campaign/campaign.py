@@ -21,12 +21,11 @@ from typing import Any
 from valve_drake import config, outputs, scenario
 from valve_drake.campaign.statistics import interval
 from valve_drake.campaign.trial import Record, Trial, perform, turned
-from valve_drake.checks import ConfigError, require
+from valve_drake.checks import ConfigError, OperationFailed, require
 from valve_drake.config import Uniform
 from valve_drake.versions import versions
 
 PLAN, RECORDS, LOGS = "campaign.json", "records", "logs"
-KEEP = ("all", "failed", "none")  # logs
 SAMPLE = 50  # of the turned runs, the log of every so many'th seed is kept as well, unless none are
 MOST = 100_000  # runs of one campaign
 
@@ -97,10 +96,11 @@ def run(
 ) -> list[Record]:
     """Runs what has no record yet -> all records, in the order of the trials.
 
-    Raises ConfigError if the folder holds another campaign, or one that is under way.
+    Raises ConfigError if the folder holds another campaign, or one that is under way; OperationFailed if the executor
+    loses a trial, which then has no record and is run by the next call.
     """
     trials = campaign.trials()
-    with _claimed(campaign, say):
+    with _claimed(campaign):
         records = {trial.key: record for trial in trials if (record := read(campaign.out, trial)) is not None}
         if records:
             say(f"{len(records)} of {len(trials)} runs are there already")
@@ -120,7 +120,7 @@ def run(
                 done, _ = concurrent.futures.wait(waiting, return_when=concurrent.futures.FIRST_COMPLETED)
                 for future in done:
                     trial = waiting.pop(future)
-                    record = finished(campaign, trial, future.result())
+                    record = finished(campaign, trial, _made(future, trial))
                     records[trial.key] = record
                     progress = Progress(progress.done + 1, progress.total, progress.turned + turned(record))
                     show(progress)
@@ -129,6 +129,15 @@ def run(
                 future.cancel()
             raise
     return [records[trial.key] for trial in trials]
+
+
+def _made(future: "concurrent.futures.Future[Record]", trial: Trial) -> Record:
+    """The record that an executor has made. `perform` does not fail; where it runs may: a worker dies."""
+    try:
+        return future.result()
+    except Exception as error:  # of any executor
+        words = str(error).splitlines() or [type(error).__name__]
+        raise OperationFailed(f"campaign: {trial.key} was lost: {words[0]}") from error
 
 
 def finished(campaign: Campaign, trial: Trial, record: Record) -> Record:
@@ -150,13 +159,10 @@ def record_path(out: Path, trial: Trial) -> Path:
 def read(out: Path, trial: Trial) -> Record | None:
     """The record of a trial; None if there is none. Raises ConfigError for a file that is no record of it."""
     path = record_path(out, trial)
-    try:
-        record = json.loads(path.read_bytes())
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except ValueError:
-        raise ConfigError(f"{path}: not a record of a campaign; remove it, and the trial is run again") from None
-    if not isinstance(record, dict) or (record.get("scenario"), record.get("seed")) != (trial.name, trial.seed):
+    record = _load(path)
+    if (record["scenario"], record["seed"]) != (trial.name, trial.seed):
         raise ConfigError(f"{path}: not the record of {trial.key}; remove it, and the trial is run again")
     return record
 
@@ -164,15 +170,18 @@ def read(out: Path, trial: Trial) -> Record | None:
 def read_all(out: Path) -> list[Record]:
     """All records of a campaign's folder, by scenario and seed. Raises ConfigError unless it is one."""
     plan(out)
-    records = []
-    for path in (out / RECORDS).glob("*.json"):
-        try:
-            record = json.loads(path.read_bytes())
-            record["scenario"], record["seed"], record["outcome"]
-        except (ValueError, KeyError, TypeError):
-            raise ConfigError(f"{path}: not a record of a campaign") from None
-        records.append(record)
+    records = map(_load, (out / RECORDS).glob("*.json"))
     return sorted(records, key=lambda record: (record["scenario"], record["seed"]))
+
+
+def _load(path: Path) -> Record:
+    """One record. Raises ConfigError."""
+    try:
+        record: Record = json.loads(path.read_bytes())
+        record["scenario"], record["seed"], record["outcome"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"{path}: not a record of a campaign; remove it, and the trial is run again") from None
+    return record
 
 
 def plan(out: Path) -> dict[str, Any]:
@@ -187,7 +196,7 @@ def plan(out: Path) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _claimed(campaign: Campaign, say: Callable[[str], None]) -> Iterator[None]:
+def _claimed(campaign: Campaign) -> Iterator[None]:
     """The folder is this campaign's, and nobody else's meanwhile."""
     out = campaign.out
     wanted = {
@@ -209,7 +218,7 @@ def _claimed(campaign: Campaign, say: Callable[[str], None]) -> Iterator[None]:
         except OSError:
             raise ConfigError(f"--out {str(out)!r}: a campaign is under way there") from None
         if (out / PLAN).exists():
-            _same(plan(out), wanted, out, say)
+            _same(plan(out), wanted, out)
         else:
             outputs.write(out / PLAN, json.dumps(wanted, indent=1) + "\n")
         yield
@@ -217,7 +226,7 @@ def _claimed(campaign: Campaign, say: Callable[[str], None]) -> Iterator[None]:
         os.close(lock)
 
 
-def _same(there: dict[str, Any], wanted: dict[str, Any], out: Path, say: Callable[[str], None]) -> None:
+def _same(there: dict[str, Any], wanted: dict[str, Any], out: Path) -> None:
     """Refuses to go on with another campaign: its records would be mixed with this one's."""
     for key in ("scenarios", "first_seed", "overrides"):
         if there.get(key) != wanted[key]:

@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from valve_drake.campaign.trial import break_off
 from valve_drake.checks import ConfigError, OperationFailed, require
 
-BACKENDS = ("local", "dask")
-
 
 @contextlib.contextmanager
 def executor(backend: str, jobs: int, scheduler: str | None = None) -> Iterator[concurrent.futures.Executor]:

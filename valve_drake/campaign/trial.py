@@ -141,5 +141,5 @@ def break_off() -> None:
 def _kill(process: "subprocess.Popen[bytes]") -> None:
     try:
         os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
+    except ProcessLookupError:  # it has just ended
         pass
