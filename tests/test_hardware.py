@@ -37,6 +37,7 @@ from valve_drake.stations.lcm_channels import (
 
 OUT, IN = vectors(GROUPS, "out"), vectors(GROUPS, "in")
 DOCS = Path(__file__).resolve().parent.parent / "docs" / "hardware.md"
+SILENT = 0.05  # answer_time of a robot that is to be missed [s]
 GREY = np.full((16, 16, 3), 90, np.uint8)
 
 
@@ -46,11 +47,14 @@ def values(seed: int, ports=OUT) -> dict:
 
 
 class Puppet:
-    """A robot that says what it is told to, to a link whose clock is `now`."""
+    """A robot that says what it is told to, to a link whose clock is `now`.
 
-    def __init__(self, **hardware):
+    answer_time: only a robot that is to be silent needs a short one [s]; a busy machine takes longer than that.
+    """
+
+    def __init__(self, answer_time: float = 10.0, **hardware):
         lcm = DrakeLcm("memq://")
-        self.config = HardwareConfig(answer_time=0.05, image_size=[16, 16], **hardware)
+        self.config = HardwareConfig(answer_time=answer_time, image_size=[16, 16], **hardware)
         self.told: list[str] = []
         self.link = RobotLink(Bus(self.config, lcm), GROUPS, notice=self.told.append)
         self.link.clock = lambda: self.now
@@ -192,13 +196,13 @@ def test_the_diagrams_are_the_same_object_for_object_but_for_the_station(both):
 
 
 def test_a_robot_that_does_not_answer_is_reported_after_the_stated_time():
-    puppet = Puppet()
+    puppet = Puppet(SILENT)
     with pytest.raises(OperationFailed, match="does not answer: nothing on VALVE_BASE_STATUS, .* within 0.05 s"):
         puppet.link.start()
 
 
 def test_what_is_missing_is_named():
-    puppet = Puppet()
+    puppet = Puppet(SILENT)
     puppet.report(skip=("left_arm.status",))
     with pytest.raises(OperationFailed, match="nothing on VALVE_LEFT_ARM_STATUS within"):
         puppet.link.start()
@@ -234,12 +238,12 @@ def test_another_type_on_a_channel_is_refused():
 def test_a_long_wait_for_the_robot_says_what_is_missing_and_the_operator_can_end_it(monkeypatch):
     assert HardwareConfig().answer_time == 30
     monkeypatch.setattr(hardware, "NOTICE", 0.02)
-    puppet = Puppet()
+    puppet = Puppet(SILENT)
     puppet.report(skip=("torso.status",))
     with pytest.raises(OperationFailed, match="does not answer"):
         puppet.link.start()
     assert puppet.told == ["waiting up to 0.05 s for the robot: nothing yet on VALVE_TORSO_STATUS"]
-    puppet = Puppet()
+    puppet = Puppet(SILENT)
     puppet.link.stop = lambda: True
     with pytest.raises(OperationFailed, match="stopped by the operator before"):
         puppet.link.start()
@@ -275,17 +279,17 @@ def test_another_program_or_robot_that_comes_later_is_a_fault(puppet):
 
 
 def test_lock_step_is_kept_by_both_or_by_none():
-    puppet = Puppet(lockstep=True)
+    puppet = Puppet(SILENT, lockstep=True)
     with pytest.raises(OperationFailed, match="does not run in lock-step"):
         puppet.start()
-    puppet = Puppet()
+    puppet = Puppet(SILENT)
     puppet.bus.say("robot.sync", 0, {"tick": -1, "messages": 0})
     with pytest.raises(ConfigError, match="runs in lock-step"):
         puppet.start()
 
 
 def test_the_station_waits_for_its_robot_when_it_is_initialised_and_then_shows_what_was_measured():
-    puppet = Puppet()
+    puppet = Puppet(SILENT)
     simulator = Simulator(make_hardware_station(puppet.link))
     with pytest.raises(OperationFailed, match="does not answer"):
         simulator.Initialize()
