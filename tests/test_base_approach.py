@@ -91,12 +91,10 @@ class Run:
     details: set
 
 
-def drive(
-    mode, wheels, scene, *, limit=40.0, config=CONFIG, alter=None, arms=None, visible=None, watch=None, scale=1.0
-):
+def drive(mode, wheels, scene, *, limit=40.0, config=CONFIG, alter=None, visible=None, watch=None, scale=1.0):
     """Runs one activation until it ends -> Run.
 
-    alter(t, messages) changes what is seen, visible() says whether anything is, arms(t) is a joint speed,
+    alter(t, messages) changes what is seen, visible() says whether anything is,
     watch(robot_state, mode, messages) is called each tick. scale: of the odometry's distances.
     """
     memory, poses, twists, details = Memory(), [], [], set()
@@ -110,7 +108,7 @@ def drive(
         odometry = np.concatenate([wheels.pose, wheels.twist]) * [scale, scale, 1, scale, 1]
         if scene.noise:
             odometry[:3] += scene.rng.normal(size=3) * np.array([3e-4, 3e-4, 3e-4])
-        robot = RobotState(time=t, odometry=odometry, left_arm_velocity=np.full(6, arms(t) if arms else 0.0))
+        robot = RobotState(time=t, odometry=odometry)
         if watch:
             watch(robot, state, seen)
         memory, command, status = step(
@@ -332,6 +330,15 @@ def test_rough_approach_turns_to_the_marker_and_stops_between_its_two_distances(
         line = scene.marker[:2] - run.poses[:, :2]
         bearing = np.abs([wrap(a) for a in np.arctan2(line[:, 1], line[:, 0]) - run.poses[:, 2]])
         assert np.all(run.twists[bearing > CONFIG.facing + 0.1, 0] == 0)  # turns first
+
+
+def test_rough_approach_brakes_as_soon_as_it_is_near_enough_and_does_not_creep_on():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(1))
+    run = drive(Mode.ROUGH_APPROACH, Wheels(place(scene, 0.0, 3.5)), scene, limit=25)
+    near = np.linalg.norm(scene.marker[:2] - run.poses[:, :2], axis=1) < CONFIG.rough_distance
+    assert run.status.state == "succeeded"
+    speed = CONFIG.approach_gain * (CONFIG.rough_distance - CONFIG.rough_stop)  # there
+    assert np.count_nonzero(near) * DT < speed / CONFIG.acceleration + 0.3  # the lag of drive and stillness
 
 
 @pytest.mark.parametrize("distance", [1.0, 1.3, 1.9])

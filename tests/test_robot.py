@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import Simulator
 from robot_facts import MIRROR, ROBOT
 from robot_variants import part, put, seven_joints, variant, with_roll
 
 from valve_drake import cli, yaml_file
 from valve_drake.checks import ConfigError
-from valve_drake.diagram import make_blocks, make_diagram
+from valve_drake.diagram import initial_commands, make_blocks, make_diagram, make_station
 from valve_drake.frames import compose, make, planar, rot_z
 from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.recording.signals import commanded
@@ -350,6 +351,25 @@ def test_sizes_and_names_of_the_whole_program_follow_the_robot(tmp_path):
     assert "left_arm_roll.position" in commanded(robot.groups)["left_arm.position_command"]
     system = make_diagram(resolve(load(None, [f"robot={tmp_path / 'robot.yaml'}"])))
     check_contract(system.station, robot.groups)
+
+
+def test_an_arm_of_seven_joints_follows_its_commands_though_its_file_has_no_gains_for_one(tmp_path):
+    """Its servo comes of its effort; upper arm and forearm, which overlap at the roll, do not push each other away."""
+    variant(tmp_path, seven_joints, with_roll)
+    scenario = resolve(load(None, [f"robot={tmp_path / 'robot.yaml'}"]))
+    station = make_station(scenario)
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    commands = initial_commands(scenario)
+    for port, value in commands.items():
+        station.GetInputPort(port).FixValue(context, value)
+    simulator.AdvanceTo(0.5)
+    moved = commands["left_arm.position_command"] + [0, 0, 0.1, 0, 0, 0, 0]
+    station.GetInputPort("left_arm.position_command").FixValue(context, moved)
+    simulator.AdvanceTo(1.0)
+    for side, asked in ((LEFT, moved), (RIGHT, commands["right_arm.position_command"])):
+        arm = station.GetOutputPort(f"{side}_arm.position_measured").Eval(context)
+        np.testing.assert_allclose(arm, asked, atol=2e-3)
 
 
 def test_a_run_with_a_wrong_robot_ends_at_once_and_leaves_nothing(tmp_path, capsys):

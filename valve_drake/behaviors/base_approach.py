@@ -1,6 +1,6 @@
 """Stages 1 and 2 on wheels: drives the base (a differential drive) to the stance before the valve, and away again.
 
-    rough_approach  turns towards the marker's position of stage 1 and drives until it is nearer than 2 m.
+    rough_approach  turns towards the marker's position of stage 1, drives until it is nearer than 2 m, and brakes.
     fine_approach   by the pose of stage 2, to the stance that kinematic_approach asks for:
                         turn    to point the front or the back to the pre-stance, a point straight behind the stance
                         drive   to it, forwards or backwards, whichever keeps the marker better in view
@@ -9,7 +9,7 @@
                         settle  trim heading and distance, stand still, check
                     A differential drive cannot step sideways: if it ends beside the stance, it backs off and goes
                     through all phases again.
-    retreat         straight back, once the arms are still.
+    retreat         straight back; the arms are folded.
 
 The base's centre never comes nearer to the panel's plane than `clearance`. A stance nearer than that is refused; from
 an allowed start the base drives straight lines between allowed points, so no line can cross the clearance. From a
@@ -127,7 +127,7 @@ class Memory:
     phase: str = "plan"
     direction: float = 1.0  # of driving to the pre-stance: 1 forwards, -1 backwards
     attempt: int = 0
-    quiet_since: float = 0.0  # since when the base or the arms are at rest [s]
+    quiet_since: float = 0.0  # since when the base is at rest [s]
 
 
 def step(
