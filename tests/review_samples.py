@@ -193,7 +193,7 @@ def messages(end=END):
                 ("/stereo_positioning/position", StereoPosition(time=capture, sequence=k // 16, found=True, p_LV=p))
             )
         if t == 5.25:
-            done = Status(time=t, activation=9, state="succeeded", progress=1.0, value=ANGLE + 0.001)
+            done = Status(time=t, activation=9, state="succeeded", value=ANGLE + 0.001, seen=True)
             found.append(("/kinematic_approach/status", done))
         for topic, message in found:
             yield topic, message, t

@@ -25,6 +25,8 @@ words = sys.argv[1:]
 seed, log = int(words[words.index("--seed") + 1]), words[words.index("--log") + 1]
 with open(os.environ["BEGUN"], "a") as file:
     file.write(f"{seed}\\n")
+with open(os.environ["BEGUN"] + ".pids", "a") as file:
+    file.write(f"{os.getpid()}\\n")
 time.sleep(float(os.environ.get("TAKES", "0")))
 if seed == 13:
     sys.exit("segmentation fault, or so")
@@ -206,6 +208,24 @@ def test_a_file_that_is_not_the_record_is_one_line_that_names_it(tmp_path, fake,
     path.write_text(text)
     with pytest.raises(ConfigError, match="simulated-1.json: not .* remove it, and the trial is run again"):
         run(wanted(tmp_path / "out", 1))
+
+
+def test_the_runs_of_a_campaign_that_is_killed_die_with_it(tmp_path, fake, monkeypatch):
+    monkeypatch.setenv("TAKES", "60")
+    script = KILLED.format(program=str(tmp_path / "fake.py"), out=str(tmp_path / "out"))
+    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(script)])
+    pids = tmp_path / "begun.pids"
+    deadline = time.monotonic() + 30
+    while not (pids.exists() and len(pids.read_text().split()) == 2) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    runs = [Path("/proc") / pid / "cmdline" for pid in pids.read_text().split()]
+    assert len(runs) == 2
+    deadline = time.monotonic() + 10
+    while any(run.exists() and run.read_bytes() for run in runs):  # an orphan that is dead may wait to be reaped
+        assert time.monotonic() < deadline, "a run goes on without its campaign"
+        time.sleep(0.02)
 
 
 def test_an_interrupt_ends_the_runs_that_are_under_way(tmp_path, fake, monkeypatch):

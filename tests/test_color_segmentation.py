@@ -15,6 +15,7 @@ from valve_drake.analysis.drawn_images import METAL, Canvas, draw_bar
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError
 from valve_drake.messages import CameraFrame, ModeState
+from valve_drake.perception import color_segmentation_system
 from valve_drake.perception.color_segmentation import (
     ColorSegmentationConfig,
     _shares,
@@ -237,6 +238,24 @@ def test_block_follows_and_finds_again_after_a_jump():
     dut.fix(head_left_image=frame("l", moved, 1), head_right_image=frame("r", moved, 1))
     seen = dut.run(0.3).read("segmentation").left.candidates[0]
     np.testing.assert_allclose(seen.center, true_center(facing(2.0, 0.2, 0.1, x=0.35)), atol=1.5)
+
+
+@pytest.mark.parametrize("afresh", [False, True])
+def test_block_looks_near_the_last_place_unless_the_mode_wants_it_afresh(afresh, monkeypatch):
+    image, dut = rig(afresh=afresh)
+    boxes = []
+    look = color_segmentation_system.segmented
+
+    def segmented(frame, config, box=None):
+        boxes.append(box)
+        return look(frame, config, box)
+
+    monkeypatch.setattr(color_segmentation_system, "segmented", segmented)
+    dut.run(0.1)
+    dut.fix(head_left_image=frame("l", image, 1), head_right_image=frame("r", image, 1))
+    dut.run(0.3)
+    assert boxes[:2] == [None, None]
+    assert [box is None for box in boxes[2:]] == [afresh, afresh]
 
 
 def test_clone_goes_its_own_way_and_repeats():

@@ -46,6 +46,16 @@ def test_modes_with_their_durations_attempts_and_reasons(summary):
     assert summary.mode_durations()["servo"] == 1.0
 
 
+def test_a_log_of_before_the_field_seen_shows_the_cameras_angle_too(tmp_path):
+    def older(topic, message, time):
+        if topic == "/kinematic_approach/status" and message.seen:
+            return dc.replace(message, seen=False, progress=1.0)
+        return message
+
+    sample.write_run(tmp_path / "run.mcap", change=older)
+    assert summarize(tmp_path / "run.mcap").angle_camera_rad == sample.ANGLE + 0.001
+
+
 def test_angles_by_camera_hands_and_truth(summary):
     assert summary.angle_hands_rad == pytest.approx(sample.ANGLE, abs=0.01)
     assert summary.angle_camera_rad == sample.ANGLE + 0.001

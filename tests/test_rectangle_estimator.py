@@ -189,7 +189,9 @@ def test_block_holds_follows_the_axis_and_forgets_it_at_a_search():
         dut.fix(edges=at(edge_points(X, HEAD, MARKER, 0.05), k))
         found = dut.run(0.2 + k / 8).read("estimate")
         np.testing.assert_allclose(found.X_LV, X, atol=1e-7)
-    dut.fix(mode=ModeState(afresh=True, activation=2), edges=at(edge_points(X, HEAD, MARKER, 0.05), 9))
+    dut.fix(mode=ModeState(activation=2), edges=at(edge_points(X, HEAD, MARKER, 0.05), 8))
+    np.testing.assert_allclose(dut.run(1.2).read("estimate").X_LV, X, atol=1e-7)  # another mode keeps the track
+    dut.fix(mode=ModeState(afresh=True, activation=3), edges=at(edge_points(X, HEAD, MARKER, 0.05), 9))
     assert dut.run(1.4).read("estimate").X_LV[0, 0] > 0.6  # n_x > 0 again
     assert dut.read("estimate", clone) is first
     again = rig(at(edge_points(facing(1.0, 0.1, 0.1, 0.5), HEAD, MARKER, 0.05), 0)).run(0.1).read("estimate")

@@ -276,6 +276,8 @@ WRONG = {
     "work beyond a limit": (at("arms.right.work", [9, 0, 0, 0, 0, 0]), "arms.right.work[0] must be within [-2.97, "),
     "too few values": (at("arms.left.home", [0, 0]), "arms.left.home must be one value for each of 6 joints"),
     "speeds of another arm": (at("arm_speed", [1.0] * 7), "arm_speed must be one value for each of 6 joints"),
+    "a joint faster than its model": (at("arm_speed", [1.2, 2.6, 1, 1, 1, 1]), "arm_speed[1] must be at most 2.5"),
+    "a waist faster than its model": (at("gaze.waist_speed", 1.6), "gaze.waist_speed must be at most 1.5"),
     "left and right mixed": (swapped, "arms.left.joints[0] must carry left_grip, got 'right_arm_1'"),
     "joints from the hand inwards": (
         at("arms.left.joints", [f"left_arm_{k}" for k in (6, 5, 4, 3, 2, 1)]),
@@ -343,6 +345,25 @@ def test_a_robot_that_the_program_cannot_use_is_refused_in_one_line(tmp_path, ca
     with pytest.raises(ConfigError) as error:
         make_blocks(load(None, [f"robot={path}", *overrides]))
     assert words in str(error.value) and str(error.value).startswith(str(path)) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("joint", "upper", "words"),
+    [
+        ("waist", 0.3, "valve_search.sweep_waist must be within what the robot's joint can do, [0, 0.3], got 0.5"),
+        (
+            "neck_pitch",
+            1.0,
+            "valve_search.pitch_high must be within what the robot's joint can do, [-0.5, 1]",
+        ),
+        ("neck_yaw", 1.2, "valve_search.yaw_limit must be within what the robot's joint can do, [0, 1.2], got 1.55"),
+    ],
+)
+def test_a_gaze_is_planned_within_the_robots_joints(tmp_path, joint, upper, words):
+    path = variant(tmp_path, lambda model: put(part(model, "joint", joint), "axis/limit/upper", str(upper)))
+    with pytest.raises(ConfigError) as error:
+        make_blocks(load(None, [f"robot={path}"]))
+    assert words in str(error.value)
 
 
 def test_sizes_and_names_of_the_whole_program_follow_the_robot(tmp_path):

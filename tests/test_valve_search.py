@@ -382,6 +382,37 @@ def test_ports():
     }
 
 
+@pytest.mark.parametrize(("rest", "waist"), [([0.3, 0.1, 0.0], None), ([0.3, 0.0, 0.1, 0.0], 1)])
+def test_a_lift_stays_where_it_rests_and_a_robot_without_a_waist_turns_its_head_alone(rest, waist):
+    rest = np.array(rest)
+    gazes = []
+
+    def head(base, torso):
+        assert torso.shape == rest.shape
+        gazes.append(torso)
+        return HEAD(base, np.array([0.0 if waist is None else torso[waist], *torso[-2:]]))
+
+    dut = Rig(
+        ValveSearchSystem(CONFIG, head, rest, waist),
+        robot_state=robot_state(torso=rest, history=np.zeros((1, 4 + len(rest)))),
+        mode=ModeState(mode="search", activation=1),
+    )
+    swept = []
+    for k in range(1, 60):
+        dut.fix(position=StereoPosition(time=k / 16, sequence=k, X_OL=HEAD(np.zeros(3), np.array([0, 0.1, 0.02 * k]))))
+        swept.append(dut.run(k / 16).read("command").torso)
+    swept = np.array(swept)
+    assert np.all(swept[:, 0] == 0.3)  # the lift
+    assert np.ptp(swept[:, -1]) > 0.2  # pan
+    if waist is not None:
+        assert np.ptp(swept[:, waist]) > 0.05
+    dut.fix(  # a sighting is centred: tilt and pan of the robot's own joints
+        mode=ModeState(mode="measure", activation=2),
+        position=StereoPosition(4.0, 99, True, np.array([0.0, 0.3, 2.0]), X_OL=HEAD(np.zeros(3), np.zeros(3))),
+    )
+    assert dut.run(4.5).read("command").torso[-2] > rest[-2] + 0.02 and gazes
+
+
 def test_block_begins_its_sweep_with_open_perception_ports_and_waits_for_an_image():
     dut = rig().run(1.0)
     assert 0.2 < abs(dut.read("command").torso[2]) < CONFIG.ahead
