@@ -294,6 +294,13 @@ def test_a_robots_log_has_no_truth_and_is_replayed_and_reviewed_as_any(path, log
     }
 
 
+def test_a_logs_own_robot_is_used_where_the_file_that_it_names_is_gone(log, tmp_path):
+    scenario = log.metadata["run"]["scenario"].replace("robot: robot/robot.yaml", "robot: gone/robot.yaml")
+    assert "gone/robot.yaml" in scenario
+    moved = rewritten(log, tmp_path / "a.mcap", lambda topic: True, 1.0, scenario=scenario)
+    assert runner.replay(LogReader(moved)).comparison.identical
+
+
 @pytest.mark.parametrize("topic", ["/health", "/joint_states", "/operator/command", "/left_wrist/wrench"])
 def test_a_missing_topic_is_named_in_one_line(topic, log, tmp_path, capsys):
     lacking = rewritten(log, tmp_path / "a.mcap", lambda name: name != topic)
