@@ -93,6 +93,7 @@ def text_of(found):
         ("<robot/>", "no <link> in it"),
         (robot(link("a"), link("a")), "two links are named 'a'"),
         (robot(link("")), "a <link> has no name (number 1 of the file)"),
+        (robot(link("a&#10;model: b")), r"a link's name must be of printable characters, got 'a\nmodel: b'"),
         (robot(link("a"), link("b")), "must be one tree, but 2 links hang on no joint: ['a', 'b']"),
         (robot(link("a"), joint("j", "a", "c")), "joint 'j': its child is no link of the file: 'c'"),
         (

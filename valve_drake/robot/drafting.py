@@ -34,6 +34,7 @@ _MOUNT = re.compile(r"screw|mount|base", re.IGNORECASE)
 _FORCE = re.compile(r"(?<![a-z])ft(?![a-z])|force|torque|wrench|sensor", re.IGNORECASE)
 _WHEEL = re.compile(r"wheel|caster", re.IGNORECASE)
 _OMNI = re.compile(r"omni|mecanum|caster", re.IGNORECASE)
+_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")  # YAML reads them as no name
 
 
 def side_of(name: str) -> str | None:
@@ -522,7 +523,8 @@ def _round(value: float) -> float:
 
 def _key(name: str) -> str:
     """A name as a key of YAML."""
-    return name if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", name) else "'" + name.replace("'", "''") + "'"
+    plain = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", name) and name.lower() not in _WORDS
+    return name if plain else "'" + name.replace("'", "''") + "'"
 
 
 def _flow(values: Iterable[object]) -> str:

@@ -147,6 +147,8 @@ def parse(data: bytes, source: str) -> Robot:
         raise ConfigError(f"{source}: its root element is <{element.tag[:40]}>: {hint}")
     _refuse_xacro(element, source)
     name = element.get("name", "").strip() or Path(source).stem
+    if not name.isprintable():
+        raise ConfigError(f"{source}: the robot's name must be of printable characters, got {shown(name)}")
     links = _named(element, "link", source)
     if not links:
         raise ConfigError(f"{source}: no <link> in it")
@@ -273,6 +275,8 @@ def _named(element: ET.Element, tag: str, source: str) -> dict[str, ET.Element]:
         name = item.get("name", "")
         if not name:
             raise ConfigError(f"{source}: a <{tag}> has no name (number {len(out) + 1} of the file)")
+        if not name.isprintable():
+            raise ConfigError(f"{source}: a {tag}'s name must be of printable characters, got {shown(name)}")
         if name in out:
             raise ConfigError(f"{source}: two {tag}s are named {shown(name)}")
         out[name] = item
