@@ -5,12 +5,13 @@ scenario are in diagrams/ (made by `valve-drake draw`; a test keeps them current
 """
 
 import dataclasses as dc
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, LeafSystem
 from pydrake.systems.primitives import Multiplexer
 
 from valve_drake import resources
@@ -240,11 +241,12 @@ def make_diagram(
     workers: CameraWorkers | None = None,
     link: RobotLink | None = None,
     truth: bool = True,
+    added: Mapping[LeafSystem, Mapping[str, str]] | None = None,
 ) -> System:
     """The whole system for a resolved scenario; `recording` is what station `replay` shows, `link` leads to a robot.
 
     workers: of `rig_of`, render the simulated cameras' images in other processes. truth=False: the recorder gets no
-    `truth.*` ports.
+    `truth.*` ports. added: systems of one's own, and for each of their input ports "<block>.<port>" that it reads.
     """
     builder = DiagramBuilder()
     station = builder.AddSystem(make_station(scenario, meshcat, recording, workers, link))
@@ -257,6 +259,11 @@ def make_diagram(
         (a, output), (b, port) = source.split(".", 1), target.split(".", 1)
         builder.Connect(systems[a].GetOutputPort(output), systems[b].GetInputPort(port))
     builder.ExportInput(systems["supervisor"].GetInputPort("operator"), OPERATOR)
+    for own, inputs in (added or {}).items():
+        builder.AddSystem(own)
+        for port, source in inputs.items():
+            a, output = source.split(".", 1)
+            builder.Connect(systems[a].GetOutputPort(output), own.GetInputPort(port))
     if recorder is not None:
         builder.AddSystem(recorder)
         _connect_recorder(builder, recorder, systems, robot_of(scenario).groups, truth)
