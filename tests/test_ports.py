@@ -115,6 +115,22 @@ def test_a_port_that_may_be_none_says_so():
     assert heard[0] is None and type(heard[1]) is Health
 
 
+def test_a_port_of_a_table_reads_as_its_message_while_nothing_is_connected():
+    class Chief(Block[Inputs, list]):
+        INPUTS = {"one": RUNNING, "other": Status}
+
+        def initial(self):
+            return []
+
+        def step(self, time, inputs, memory):
+            return [*memory, inputs["one"].state, inputs["other"].state], {}
+
+    rig = Rig(Chief("chief"), other=Value(Status())).run(TICK)
+    assert rig.block.memory(rig.context) == ["running", "idle"]
+    with pytest.raises(RuntimeError, match="other.*chief.*nothing is connected"):
+        Rig(Chief("chief")).run(TICK)
+
+
 def test_unknown_ports_are_errors_and_no_port_can_be_written():
     def reading(work):
         class Curious(Counter):

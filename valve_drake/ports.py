@@ -151,11 +151,11 @@ class Block(PythonSystem, Generic[In, M]):
     """A stage on ports. A subclass names its Inputs and its memory's type, sets OUTPUTS and writes `step`.
 
     OUTPUTS: port name -> message class, or vector size. INPUTS: ports beside the annotated ones, for names that come
-    from a table. AWAKE: a block with an input port `mode` steps in these modes; of another mode it takes one step, the
+    from a table; a message instead of its class is what the port reads as while nothing is connected. AWAKE: a block with an input port `mode` steps in these modes; of another mode it takes one step, the
     first, and then its outputs hold: nobody listens, and nothing is logged.
     """
 
-    INPUTS: Mapping[str, Kind] = {}
+    INPUTS: Mapping[str, Kind | Message] = {}
     OUTPUTS: Mapping[str, Kind] = {}
     AWAKE: ClassVar[frozenset[str] | None] = None  # the modes in which it steps; None: in all
     _inputs: ClassVar[type[Inputs]] = Inputs
@@ -173,13 +173,15 @@ class Block(PythonSystem, Generic[In, M]):
         self._name = name
         self.sources: dict[str, Source] = {}
         for port, kind in {**self._inputs.PORTS, **self.INPUTS}.items():
+            annotated = getattr(self._inputs, port, None)
+            default = annotated.default if isinstance(annotated, _Port) else _REQUIRED
+            if isinstance(kind, Message):
+                kind, default = type(kind), kind
             if isinstance(kind, int):
                 declared = self.DeclareVectorInputPort(port, kind)
             else:
                 model = Value(kind()) if isinstance(kind, type) else kind
                 declared = self.DeclareAbstractInputPort(port, model)
-            annotated = getattr(self._inputs, port, None)
-            default = annotated.default if isinstance(annotated, _Port) else _REQUIRED
             self.sources[port] = Source(declared, declared.Eval, kind if isinstance(kind, type) else object, default)
         self._memory = int(self.DeclareAbstractState(Value(Held(self.initial()))))
         self._messages: dict[str, int] = {}  # output port -> index of its abstract state

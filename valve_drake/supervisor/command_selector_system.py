@@ -23,11 +23,6 @@ class CommandSelectorInputs(Inputs):
     mode: ModeState
     robot_state: RobotState
     health: Health
-    valve_search: Command | None = None
-    base_approach: Command | None = None
-    kinematic_approach: Command | None = None
-    image_servo: Command | None = None
-    hybrid_rotation: Command | None = None
 
 
 class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
@@ -49,6 +44,8 @@ class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
     initial: what the output vectors hold until the first robot state, by port name. torso, arms: of the
     robot, these by side.
     """
+
+    INPUTS = dict.fromkeys(BEHAVIORS, Command())
 
     def __init__(
         self,

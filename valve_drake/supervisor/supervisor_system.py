@@ -10,11 +10,6 @@ class SupervisorInputs(Inputs):
     operator: OperatorCommand = OperatorCommand()
     health: Health | None = None  # a station that reports nothing is a fault
     selector: SelectorReport | None = None
-    valve_search: Status = Status()
-    base_approach: Status = Status()
-    kinematic_approach: Status = Status()
-    image_servo: Status = Status()
-    hybrid_rotation: Status = Status()
 
 
 class SupervisorSystem(Block[SupervisorInputs, State]):
@@ -29,6 +24,7 @@ class SupervisorSystem(Block[SupervisorInputs, State]):
     mode                out  ModeState
     """
 
+    INPUTS = dict.fromkeys(BEHAVIORS, Status())
     OUTPUTS = {"mode": ModeState}
 
     def __init__(self, config: SupervisorConfig, name: str = "supervisor"):
