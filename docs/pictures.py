@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from valve_drake import resources
+from valve_drake import named_files
 from valve_drake import scenario as scenarios
 from valve_drake.analysis.metrics import summarize
 from valve_drake.analysis.traces import Traces
@@ -54,7 +54,7 @@ def main(log: Path, folder: Path) -> None:
     assert robot is not None
     simulation = scenario.simulation
     simulation.light.intensity, simulation.light.fill = 0.95, 0.35
-    head = load_head(resources.find(scenario.head_calibration, resources.models()))
+    head = load_head(named_files.find(scenario, "head_calibration"))
     rig = CameraRig(
         make_mounts(head, simulation, scenario.seed, robot.description.cameras),
         simulation.valve,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from robot_facts import ROBOT
 
-from valve_drake import resources, scenario
+from valve_drake import named_files, scenario
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import OperationFailed
 from valve_drake.stations.camera_rig import CameraRig, Capture
@@ -21,7 +21,7 @@ from valve_drake.stations.simulated import make_mounts
 @pytest.fixture(scope="module")
 def rig_arguments():
     sc = scenario.resolve(scenario.load(None, ["seed=5", "simulation.camera.noise=2", "simulation.camera.blur=0.5"]))
-    head = load_head(resources.find(sc.head_calibration, resources.models()))
+    head = load_head(named_files.find(sc, "head_calibration"))
     mounts = make_mounts(head, sc.simulation, 5, ROBOT.description.cameras)
     return mounts, sc.simulation.valve, tuple(sc.marker.size), sc.simulation.light, sc.simulation.camera, 5
 

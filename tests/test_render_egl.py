@@ -28,7 +28,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 from robot_facts import ROBOT
 
-from valve_drake import resources, scenario
+from valve_drake import named_files, resources, scenario
 from valve_drake.camera.lens import Lens, load_head
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads
@@ -46,7 +46,7 @@ INFO = CameraInfo(320, 240, 300.0, 290.0, 161.3, 118.2)
 def rig(renderer: str) -> CameraRig:
     keys = {"renderer": renderer, "supersample": 2, "noise": 0.0}
     sc = scenario.resolve(scenario.load(None, ["seed=5", *(f"simulation.camera.{k}={v}" for k, v in keys.items())]))
-    head = load_head(resources.find(sc.head_calibration, resources.models()))
+    head = load_head(named_files.find(sc, "head_calibration"))
     mounts, simulation = make_mounts(head, sc.simulation, 5, ROBOT.description.cameras), sc.simulation
     return CameraRig(mounts, simulation.valve, tuple(sc.marker.size), simulation.light, simulation.camera, 5)
 

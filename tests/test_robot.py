@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 from robot_facts import MIRROR, ROBOT
 from robot_variants import part, put, seven_joints, variant, with_roll
 
-from valve_drake import cli, yaml_file
+from valve_drake import cli, named_files, resources, yaml_file
 from valve_drake.checks import ConfigError
 from valve_drake.diagram import initial_commands, make_blocks, make_diagram, make_station
 from valve_drake.frames import compose, make, planar, rot_z
@@ -208,6 +208,46 @@ def test_a_gripper_whose_joint_falls_as_it_opens(tmp_path):
     assert gripper.opening(-0.03) == pytest.approx(0.06) and gripper.position(0.06) == pytest.approx(-0.03)
 
 
+def test_colors_paint_the_models_materials_over(tmp_path):
+    robot = Robot.load(variant(tmp_path, change=at("colors", {"accent": [0.1, 0.2, 0.3, 1.0]})))
+
+    def color(robot, link, name):
+        inspector = robot.model.scene_graph.model_inspector()
+        for shape in robot.model.plant.GetVisualGeometriesForBody(robot.model.plant.GetBodyByName(link)):
+            if inspector.GetName(shape).endswith(name):
+                return inspector.GetPerceptionProperties(shape).GetProperty("phong", "diffuse").rgba.tolist()
+
+    for link in ("left_hand", "right_finger_1_link", "chest"):
+        assert color(robot, link, "accent") == pytest.approx([0.1, 0.2, 0.3, 1.0])
+        assert color(robot, link, "dark") == color(ROBOT, link, "dark")
+    pr2 = Robot.load(description.find("pr2/pr2.robot.yaml"))  # of a URDF: the finger tips, green in the file
+    assert color(pr2, "l_gripper_l_finger_tip_link", "1") == pytest.approx([0.5, 0.5, 0.5, 1.0])
+
+
+def test_pads_get_a_grid_of_contact_points_where_their_surfaces_are(tmp_path):
+    """That of our own pads' file, taken out and asked for by `pad`, is the same but for half a millimetre."""
+
+    def edit(m):
+        for side in SIDES:
+            for k in (1, 2):
+                link = part(m, "link", f"{side}_finger_{k}_link")
+                for shape in [c for c in link.findall("collision") if c.get("name").startswith("pad_")]:
+                    link.remove(shape)
+
+    def points(robot, link):
+        plant, inspector = robot.model.plant, robot.model.scene_graph.model_inspector()
+        shapes = plant.GetCollisionGeometriesForBody(plant.GetBodyByName(link))
+        pads = [shape for shape in shapes if "pad_" in inspector.GetName(shape)]
+        return np.array([inspector.GetPoseInFrame(shape).translation() for shape in pads])
+
+    change = at("pad", {"at": [0, 0, 0], "size": [0.022, 0.016], "friction": 0.8})
+    robot = Robot.load(variant(tmp_path, edit, change))
+    for side in SIDES:
+        for k, inwards in ((1, -1), (2, 1)):
+            link = f"{side}_finger_{k}_link"
+            assert points(robot, link) == pytest.approx(points(ROBOT, link) + [0, inwards * 5e-4, 0])
+
+
 def test_the_pr2_is_described_by_its_file():
     robot = Robot.load(description.find("pr2/pr2.robot.yaml"))
     assert robot.posture.names == ("torso_lift_joint",) and robot.base.names == ("base_x", "base_y", "base_yaw")
@@ -311,6 +351,12 @@ WRONG = {
     "a fixed base that moves": (at("base.drive", "fixed"), "base.drive must be one that moves: base_x, base_y"),
     "an angle for a length": (at("opening", 1.5), "opening must be within [0.01, 0.5], got 1.5"),
     "a weld of nothing": (at("weld", ["elbow"]), "weld[0] must be a joint of the model, got 'elbow'"),
+    "a colour of no material": (
+        at("colors", {"accents": [0, 0, 0, 1]}),
+        "colors.accents must be a material of the model, got 'accents'; near it: accent",
+    ),
+    "a colour of 8 bits": (at("colors", {"accent": [255, 0, 0, 255]}), "colors.accent[0] must be within [0, 1]"),
+    "a pad in millimeters": (at("pad", {"size": [22, 16]}), "pad.size[0] must be within [0, 0.1], got 22"),
     "text for a number": (at("opening", "wide"), "opening must be a finite number, got 'wide'"),
 }  # fmt: skip
 
@@ -345,6 +391,44 @@ def test_a_robot_that_the_program_cannot_use_is_refused_in_one_line(tmp_path, ca
     with pytest.raises(ConfigError) as error:
         make_blocks(load(None, [f"robot={path}", *overrides]))
     assert words in str(error.value) and str(error.value).startswith(str(path)) and "\n" not in str(error.value)
+
+
+NAMED = {
+    "no calibration": (at("head_calibration", ""), "head_calibration must be given: `valve-drake calibrate stereo`"),
+    "a calibration that is not there": (
+        at("head_calibration", "head.yaml"),
+        "robot.yaml: head_calibration: no such file: ",
+    ),
+    "a calibration in no package": (
+        at("head_calibration", "package://pr9/head.yaml"),
+        "robot.yaml: head_calibration: no package 'pr9'",
+    ),
+    "a calibration that is none": (at("head_calibration", "robot.yaml"), "robot.yaml lacks X_LR, left, right and has"),
+    "nothing taught": (at("taught", ""), "taught must be given: `valve-drake teach` makes it"),
+    "references that are not there": (at("taught", "hands.yaml"), "robot.yaml: taught: no such file: "),
+    "references that are none": (at("taught", "robot.yaml"), "robot.yaml: no taught references: must be a mapping of"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", NAMED)
+def test_a_file_that_a_robot_names_and_that_is_none_is_refused_in_one_line(tmp_path, case):
+    change, words = NAMED[case]
+    path = variant(tmp_path, change=change)
+    with pytest.raises(ConfigError) as error:
+        make_blocks(load(None, [f"robot={path}"]))
+    assert words in str(error.value) and str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_files_of_a_robot_lie_beside_its_own_and_a_scenarios_go_before_them(tmp_path):
+    path = variant(tmp_path / "robot", change=lambda given: given.update(head_calibration="head.yaml"))
+    head = path.with_name("head.yaml")
+    head.write_bytes((resources.models() / "calibration" / "head.yaml").read_bytes())
+    scenario = load(None, [f"robot={path}"])
+    assert named_files.find(scenario, "head_calibration") == head
+    assert named_files.find(scenario, "taught") == resources.models() / "taught" / "hands.yaml"
+    assert description.load(OURS).taught == "package://valve_drake_models/taught/hands.yaml"
+    other = load(None, [f"robot={path}", "head_calibration=calibration/head.yaml"])
+    assert named_files.find(other, "head_calibration") == resources.models() / "calibration" / "head.yaml"
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, LeafSystem
 from pydrake.systems.primitives import Multiplexer
 
-from valve_drake import resources
+from valve_drake import named_files
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.behaviors.grasp_geometry import Stances
 from valve_drake.behaviors.hybrid_rotation import HybridRotation
@@ -39,7 +39,6 @@ from valve_drake.perception.stereo_positioning_system import StereoPositioningSy
 from valve_drake.ports import Block
 from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.recording.signals import JOINED
-from valve_drake.robot import description as descriptions
 from valve_drake.robot.groups import Groups
 from valve_drake.robot.robot import Robot
 from valve_drake.robot_state_system import RobotStateSystem
@@ -112,7 +111,7 @@ class System:
 
 def robot_of(scenario: Scenario) -> Robot:
     """The robot of a scenario. Raises ConfigError if there is none, or the program cannot use it."""
-    robot = Robot.load(descriptions.find(scenario.robot))
+    robot = Robot.load(named_files.find(scenario, "robot"))
     d = robot.description
     try:
         require(not d.lift.joints, "lift.joints", "none (a lift is not supported yet)", d.lift.joints)
@@ -194,13 +193,13 @@ def rig_of(scenario: Scenario) -> tuple[Any, ...]:
 
 
 def _head(scenario: Scenario) -> StereoHead:
-    return load_head(resources.find(scenario.head_calibration, resources.models()))
+    return load_head(named_files.find(scenario, "head_calibration"))
 
 
 def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     """All blocks between the station's outputs and its inputs: the same objects for every station."""
     head = _head(scenario)
-    taught = load_taught(resources.find(scenario.taught, resources.models()))
+    taught = load_taught(named_files.find(scenario, "taught"))
     marker = scenario.marker
     view = {side: taught[side].view for side in SIDES}
     area = {side: taught[side].area for side in SIDES}

@@ -19,7 +19,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
-from valve_drake import config, outputs, profiling, resources, yaml_file
+from valve_drake import config, named_files, outputs, profiling, yaml_file
 from valve_drake.analysis.comparison import Comparison
 from valve_drake.analysis.metrics import Summary, summarize
 from valve_drake.behaviors.taught import load_taught
@@ -126,7 +126,7 @@ class Result:
 
 def make_recorder(sink: Sink, scenario: Scenario) -> RecorderSystem:
     """The recorder with all topics of the program."""
-    head = load_head(resources.find(scenario.head_calibration, resources.models()))
+    head = load_head(named_files.find(scenario, "head_calibration"))
     robot = robot_of(scenario)
     frames = RobotFrames(robot, head, scenario.marker)
     return RecorderSystem(sink, signals(robot.groups, frames, frames.scene, pinholes(head)))
@@ -244,7 +244,7 @@ def _read_files(scenario: Scenario) -> dict[str, bytes]:
     what it should be: nothing else of a user's files gets into a log."""
     files = {}
     for key, load in READERS.items():
-        path = descriptions.find(getattr(scenario, key))
+        path = named_files.find(scenario, key)
         load(path)
         files[FILES[key]] = descriptions.text(path) if key == "robot" else path.read_bytes()
     return files
@@ -537,7 +537,9 @@ def _notes(log: LogReader, recorded: Scenario, recording: Recording, changed: Co
     facts, now = log.metadata["run"], versions()
     notes = [f"{name} was {facts[name]}, is {now[name]}" for name in now if facts.get(name, now[name]) != now[name]]
     for key in (key for key, name in FILES.items() if key not in changed and name not in log.attachments):
-        notes.append(f"the log does not hold its {key}: {getattr(recorded, key)} of today stands in")
+        notes.append(
+            f"the log does not hold its {key}: {getattr(recorded, key) or 'that of its robot'} of today stands in"
+        )
     if recording.end < log.end:
         notes.append(f"replayed up to t = {recording.end:.3f} s: after that the log is incomplete")
     return notes

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from valve_drake import outputs, resources
+from valve_drake import named_files, outputs
 from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances, hand_in_valve
 from valve_drake.behaviors.taught import TaughtReference, save_taught
 from valve_drake.camera.lens import load_head
@@ -41,7 +41,7 @@ def teach(scenario: Scenario) -> tuple[dict[str, TaughtReference], dict[str, np.
     simulation.start.distance = DISTANCE
     valve = simulation.valve
     marker = scenario.marker
-    head = load_head(resources.find(scenario.head_calibration, resources.models()))
+    head = load_head(named_files.find(scenario, "head_calibration"))
     robot = robot_of(scenario)
     mounts = make_mounts(head, simulation, scenario.seed, robot.description.cameras)
     size = (marker.size[0], marker.size[1])

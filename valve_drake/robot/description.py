@@ -5,8 +5,7 @@ A description names joints and frames of the model; whether the model has them i
 
 So far a run takes robots whose groups have as many joints as our own (diagram.robot_of refuses the others), and these
 keys are checked and not yet used: base.footprint, base.speed and base.acceleration (base_approach and
-command_selector have their own), lift.speed, gaze.speed, arm_speed, stiffness, pad.size and pad.friction,
-head_calibration and taught (the scenario's keys of these names count), colors.
+command_selector have their own), lift.speed.
 """
 
 import dataclasses as dc
@@ -132,7 +131,9 @@ class PadDescription(Config):
     """
 
     at: list[float] = numbers([0.0, 0.0, 0.0], -0.3, 0.3, "middle of the surface, in the first link [m]")
-    size: list[float] = numbers([0.0, 0.0], 0.0, 0.1, "of the grid of contact points that is added [m]")
+    size: list[float] = numbers(
+        [0.0, 0.0], 0.0, 0.1, "of the grid of contact points that is added, along x and z of the grip [m]"
+    )
     friction: float = number(0.8, 0.05, 2.0, "of the added contact points")
 
 
@@ -176,9 +177,11 @@ class RobotDescription(Config):
     cameras: dict[str, str] = texts(
         {"head_left": "", "left_wrist": "", "right_wrist": ""}, "their frames: x right, y down, z forward"
     )
-    head_calibration: str = plain("", "of the stereo head: a path from this file")
-    taught: str = plain("", "references of the hands: a path from this file")
-    colors: dict[str, list[float]] = named("materials of the model that are painted over", 0.0, 1.0, (4, 4))
+    head_calibration: str = plain("", "of the stereo head (`calibrate stereo`): as model")
+    taught: str = plain("", "references of the hands (`teach`): as model")
+    colors: dict[str, list[float]] = named(
+        "red, green, blue, opacity of the model's materials (in SDF: of its visuals)", 0.0, 1.0, (4, 4)
+    )
     collision: CollisionDescription = dc.field(default_factory=CollisionDescription)
 
     def relations(self, key: str) -> None:
@@ -233,7 +236,11 @@ def parse(text: str, source: str, path: Path) -> RobotDescription:
         robot.check("")
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from error
-    robot.model = _placed(robot.model, path, source)
+    robot.model = _placed(robot.model, path)
+    find_file(robot.model, f"{source}: model", given["model"])
+    for name in ("head_calibration", "taught"):  # whoever reads one says that it is not there: a log has its own
+        if value := getattr(robot, name):
+            setattr(robot, name, _placed(value, path))
     return robot
 
 
@@ -242,12 +249,11 @@ def text(path: str | Path) -> bytes:
     return yaml_file.dump(config.tree(load(path)), "The robot of this run.").encode()
 
 
-def _placed(model: str, path: Path, source: str) -> str:
-    if model.startswith("package://"):
-        find_package_file(model, f"{source}: model")
-        return model
-    file = Path(os.path.abspath(path.parent / model))
-    require_file(file, f"{source}: model", model)
+def _placed(name: str, path: Path) -> str:
+    """A file that the robot.yaml at `path` names, as a name that leads to it from everywhere."""
+    if name.startswith("package://"):
+        return name
+    file = Path(os.path.abspath(path.parent / name))
     home = resources.models()
     if file.is_relative_to(home):
         return f"package://{PACKAGE}/{file.relative_to(home).as_posix()}"
@@ -265,10 +271,15 @@ def require_file(file: Path, key: str, given: str) -> None:
 
 def model_file(robot: RobotDescription) -> Path:
     """Where the model of a loaded description lies. Raises ConfigError."""
-    if robot.model.startswith("package://"):
-        return find_package_file(robot.model, "model")
-    require_file(Path(robot.model), "model", robot.model)
-    return Path(robot.model)
+    return find_file(robot.model, "model")
+
+
+def find_file(name: str, key: str, given: str | None = None) -> Path:
+    """A file that a loaded description names. given: how its file writes it. Raises ConfigError that names `key`."""
+    if name.startswith("package://"):
+        return find_package_file(name, key)
+    require_file(Path(name), key, name if given is None else given)
+    return Path(name)
 
 
 def find_package_file(url: str, key: str) -> Path:
@@ -279,10 +290,6 @@ def find_package_file(url: str, key: str) -> Path:
         require_file(file, key, url)
         return file
     return packages.resolve(url, None, key)
-
-
-def package_folders() -> list[Path]:
-    return [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
 
 
 def find(name: str) -> Path:

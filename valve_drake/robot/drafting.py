@@ -270,7 +270,7 @@ def _grip(robot: Robot, hand: Hand, palm: str, boxes: Boxes) -> None:
 
 
 def _surface(box: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and size of the gripping surface of a pad: the side of its box that closes, near its end.
+    """Middle and size (along the bar, along the approach) of the gripping surface of a pad, near its end.
 
     axes: (3, 2) the closing direction, from the other pad to this, and the approach, in the pad's link.
     """
@@ -283,7 +283,7 @@ def _surface(box: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     if length > 2 * PAD_LENGTH:  # a long finger holds with its end
         end = box[1, reach] if axes[reach, 1] > 0 else box[0, reach]
         at[reach] = end - np.sign(axes[reach, 1]) * PAD_LENGTH
-    size = np.array([min(PAD_LENGTH, length / 2), min(0.8 * PAD_LENGTH, float(np.ptp(box[:, width])) / 2)])
+    size = np.array([min(PAD_LENGTH, float(np.ptp(box[:, width])) / 2), min(0.8 * PAD_LENGTH, length / 2)])
     return np.round(at, 4) + 0.0, np.round(size, 4)
 
 
@@ -365,7 +365,8 @@ def draft(robot: Robot, found: Guess, model: str, mends: Iterable[str]) -> tuple
     lines += _arm_lines(robot, found, ask)
     lines += _gripper_lines(robot, found, ask)
     lines += _frame_lines(found, ask)
-    lines.append("# head_calibration, taught: " + ask("head_calibration, taught: made by calibrate and teach")[2:])
+    lines.append("# head_calibration: " + ask("head_calibration: a file by `calibrate stereo`, beside this one")[2:])
+    lines.append("# taught: " + ask("taught: a file beside this one, which `teach` makes")[2:])
     if found.colors:
         lines.append("colors:  # red and green are the colours of the marks")
         lines += [f"  {_key(name)}: [0.5, 0.5, 0.5, 1]" for name in found.colors]

@@ -3,9 +3,11 @@
 import dataclasses as dc
 import difflib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
+import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
@@ -26,7 +28,10 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from valve_drake import resources
 from valve_drake.checks import ConfigError, shown
 from valve_drake.messages import SIDES
-from valve_drake.robot.description import RobotDescription, model_file, package_folders
+from valve_drake.robot import packages
+from valve_drake.robot.description import RobotDescription, model_file
+from valve_drake.robot.pads import PadPoints, add_points, contact_points
+from valve_drake.robot.paint import painted
 
 CARRIAGE = 0.01  # mass of each that a model without planar joints gets [kg]
 EFFORT, BASE_EFFORT = 100.0, 2000.0  # of a joint whose file states none, of an added base joint [N or N m]
@@ -54,15 +59,26 @@ class Model:
     mimics: tuple[Mimic, ...]
 
 
-def parse(plant: MultibodyPlant, path: Path) -> ModelInstanceIndex:
-    """Adds the one model of a file. Raises ConfigError if Drake cannot read it, or it holds several."""
+def parse(
+    plant: MultibodyPlant, path: Path, colors: Mapping[str, Sequence[float]] = MappingProxyType({})
+) -> ModelInstanceIndex:
+    """Adds the one model of a file. colors: of its materials, in the place of the file's own.
+
+    Raises ConfigError if Drake cannot read it, or it holds several.
+    """
     parser = Parser(plant)
-    packages = parser.package_map()
-    packages.AddPackageXml(str(resources.models() / "package.xml"))
-    for folder in package_folders():
-        packages.PopulateFromFolder(str(folder))
+    known = parser.package_map()
+    known.AddPackageXml(str(resources.models() / "package.xml"))
+    for name, folder in packages.named_in(path):
+        if not known.Contains(name):
+            known.Add(name, str(folder))
     try:
-        models: list[ModelInstanceIndex] = parser.AddModels(str(path))
+        models: list[ModelInstanceIndex]
+        if colors:
+            kind = "urdf" if path.suffix.lower() == ".urdf" else "sdf"
+            models = parser.AddModelsFromString(painted(path, colors), kind)
+        else:
+            models = parser.AddModels(str(path))
     except (RuntimeError, ValueError) as error:
         raise ConfigError(f"model {path} cannot be read: {_first(str(error))}") from error
     if len(models) != 1:
@@ -81,7 +97,7 @@ def add_robot(plant: MultibodyPlant, robot: RobotDescription) -> ModelInstanceIn
     Raises ConfigError in one line: a name that the model lacks, a file that cannot be read.
     """
     path = model_file(robot)
-    model = parse(plant, path)
+    model = parse(plant, path, robot.colors)
     efforts = {name: effort for name, effort, _ in _file_joints(path) if effort is not None}
     if robot.weld:
         _weld(plant, model, robot)
@@ -102,7 +118,30 @@ def add_robot(plant: MultibodyPlant, robot: RobotDescription) -> ModelInstanceIn
             plant.AddJointActuator(name, joint, efforts.get(name, EFFORT))
     if robot.counterbalanced:
         plant.set_gravity_enabled(model, False)
+    if any(robot.pad.size) and plant.geometry_source_is_registered():
+        for side, pads in _pad_points(robot).items():
+            for k, pad in enumerate(pads):
+                frame = frame_named(plant, model, pad.frame, f"grippers.{side}.pads[{k}]")
+                add_points(plant, frame, pad.points, robot.pad.friction)
     return model
+
+
+def _pad_points(robot: RobotDescription) -> dict[str, list[PadPoints]]:
+    """The contact points of both grippers, by a model without shapes that stands apart."""
+    plant = MultibodyPlant(0.0)
+    model = add_robot(plant, robot)
+    plant.Finalize()
+    follow, out = follower(plant, model, mimics(robot)), {}
+    for side in SIDES:
+        key, spec = f"grippers.{side}", robot.gripper(side)
+        a, b = (frame_named(plant, model, name, f"{key}.pads[{k}]") for k, name in enumerate(spec.pads))
+        grip = frame_named(plant, model, f"{side}_grip", f"frames.{side}_grip")
+        joint = joint_named(plant, model, spec.joint, f"{key}.joint")
+        limits = [*joint.position_lower_limits(), *joint.position_upper_limits()]
+        if not np.isfinite(limits).all():
+            raise ConfigError(f"{key}.joint must be a joint with limits, got {shown(spec.joint)}")
+        out[side] = contact_points(plant, grip, (a, b), joint, follow, robot.pad.at, robot.pad.size)
+    return out
 
 
 def _weld(plant: MultibodyPlant, model: ModelInstanceIndex, robot: RobotDescription) -> None:
@@ -252,6 +291,24 @@ def mimics(robot: RobotDescription) -> tuple[Mimic, ...]:
     for mimic in found.values():
         add(mimic)
     return tuple(out)
+
+
+def follower(
+    plant: MultibodyPlant, model: ModelInstanceIndex, following: Iterable[Mimic]
+) -> Callable[[np.ndarray], None]:
+    """What puts the joints that follow others where they belong, in the positions of a finalized plant."""
+
+    def slot(name: str) -> int:
+        start: int = joint_named(plant, model, name, "model: mimic").position_start()
+        return start
+
+    table = [(slot(m.joint), slot(m.follows), m.multiplier, m.offset) for m in following]
+
+    def follow(q: np.ndarray) -> None:
+        for joint, leader, multiplier, offset in table:
+            q[joint] = multiplier * q[leader] + offset
+
+    return follow
 
 
 # ---------------------------------------------------------------- the controllers' model

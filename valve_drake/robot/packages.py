@@ -18,6 +18,7 @@ from valve_drake.checks import ConfigError, shown
 MAX_CRAWLED = 4  # levels of folders below an entry of ROS_PACKAGE_PATH that a package may lie in
 MAX_ABOVE = 8  # folders above a file that may hold its package
 MAX_LICENSE = 1_000_000  # of a licence's text [bytes]
+_URL = re.compile(rb"""(?:package|model)://[^"'<>\s]+""")
 _NAME = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 _LICENSES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt", "COPYING", "COPYING.txt", "license.txt")
 
@@ -67,6 +68,19 @@ def packages(name: str, beside: Path | None) -> Iterator[Path]:
         if folder not in seen and folder.is_dir():
             seen.add(folder)
             yield folder
+
+
+def named_in(path: Path) -> Iterator[tuple[str, Path]]:
+    """The packages whose files a model file names, and where they are; without those that are nowhere."""
+    found = set()
+    for match in _URL.finditer(path.read_bytes()):
+        url = match[0].decode("utf-8", "replace")
+        name, _, inside = unquote(url.partition("://")[2]).lstrip("/").partition("/")
+        if name not in found:
+            folder = next((f for f in packages(name, path.parent) if _is_file(f / inside)), None)
+            if folder is not None:
+                found.add(name)
+                yield name, folder
 
 
 def license_of(path: Path) -> Path | None:

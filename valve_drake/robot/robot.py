@@ -27,9 +27,9 @@ from valve_drake.robot.description import TORQUE, RobotDescription
 from valve_drake.robot.groups import Groups
 from valve_drake.robot.kinematics import Arm, HandLoad, Joints
 from valve_drake.robot.model import (
-    Mimic,
     Model,
     base_chain,
+    follower,
     frame_named,
     joint_named,
     make_model,
@@ -110,7 +110,7 @@ class Robot:
         self.home = _locked(np.concatenate([self.arms[side].home for side in SIDES]))
 
         self._plant, self._base_frame = plant, frame
-        self._mimics = _followers(plant, index, model.mimics)
+        self._follow = follower(plant, index, model.mimics)
         self._context = plant.CreateDefaultContext()
         self._eye = frame_named(plant, index, d.cameras["head_left"], "cameras.head_left")
         for name, camera in d.cameras.items():
@@ -301,8 +301,7 @@ class Robot:
 
     def follow(self, q: np.ndarray) -> None:
         """Puts the joints that follow others where they belong, in the plant's positions."""
-        for follower, leader, multiplier, offset in self._mimics:
-            q[follower] = multiplier * q[leader] + offset
+        self._follow(q)
 
     # ------------------------------------------------------------ read off the model, once
     def _chain(self, side: str, joint: Mapping[str, Joint]) -> _Chain:
@@ -490,13 +489,3 @@ def _carriers(plant: MultibodyPlant, index: ModelInstanceIndex, frame: Frame) ->
         out.append(joint)
         body = joint.parent_body()
     return out
-
-
-def _followers(
-    plant: MultibodyPlant, index: ModelInstanceIndex, mimics: tuple[Mimic, ...]
-) -> list[tuple[int, int, float, float]]:
-    def slot(name: str) -> int:
-        start: int = joint_named(plant, index, name, "model: mimic").position_start()
-        return start
-
-    return [(slot(m.joint), slot(m.follows), m.multiplier, m.offset) for m in mimics]
