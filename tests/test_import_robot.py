@@ -858,7 +858,7 @@ def test_the_draft_knows_arms_grippers_head_and_lift(tmp_path):
         R = urdf.rotation(np.array(grip["rpy"]))
         assert np.allclose(R[:, 2], [1, 0, 0], atol=1e-3) and np.allclose(np.abs(R[:, 1]), [0, 1, 0], atol=1e-3)
     assert math.isclose(tree["opening"], 0.092, abs_tol=1.1e-3)
-    assert np.allclose(tree["pad"]["at"], [0.02, -0.005, 0]) and np.allclose(tree["pad"]["size"], [0.02, 0.01])
+    assert np.allclose(tree["pad"]["at"], [0.02, -0.005, 0]) and np.allclose(tree["pad"]["size"], [0.01, 0.016])
     assert tree["lift"] == {"joints": ["lift_joint"], "home": [0.2], "speed": [0.05]}
     assert tree["gaze"]["pan"] == "head_pan_joint" and tree["gaze"]["tilt"] == "head_tilt_joint"
     assert tree["cameras"]["head_left"] == "left_eye_optical_frame"
