@@ -15,9 +15,9 @@ MADE_BY = {"head_calibration": "valve-drake calibrate stereo", "taught": "valve-
 
 def find(scenario: Scenario, key: str) -> Path:
     """The file of `robot`, `head_calibration` or `taught`. Raises ConfigError: none is named, or it is not there."""
-    own: str = getattr(scenario, key)
     if key == "robot":
-        return descriptions.find(own)
+        return descriptions.find(scenario.robot)
+    own = {"head_calibration": scenario.head_calibration, "taught": scenario.taught}[key]
     if own:
         return resources.find(own, resources.models())
     name: str = getattr(descriptions.load(descriptions.find(scenario.robot)), key)
