@@ -151,8 +151,9 @@ class Block(PythonSystem, Generic[In, M]):
     """A stage on ports. A subclass names its Inputs and its memory's type, sets OUTPUTS and writes `step`.
 
     OUTPUTS: port name -> message class, or vector size. INPUTS: ports beside the annotated ones, for names that come
-    from a table; a message instead of its class is what the port reads as while nothing is connected. AWAKE: a block with an input port `mode` steps in these modes; of another mode it takes one step, the
-    first, and then its outputs hold: nobody listens, and nothing is logged.
+    from a table; a message instead of its class is what the port reads as while nothing is connected. AWAKE: a block
+    with an input port `mode` steps in these modes; of another mode it takes one step, the first, and then its outputs
+    hold: nobody listens, and nothing is logged.
     """
 
     INPUTS: Mapping[str, Kind | Message] = {}
