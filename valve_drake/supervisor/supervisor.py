@@ -215,11 +215,13 @@ def _abort(s: State, time: float, end: Mode, verdict: Verdict, reason: str) -> S
 
 def _succeed(s: State, time: float, status: Status) -> State:
     reason = status.detail or f"{s.mode.value} succeeded"
+    if s.verdict and s.mode != Mode.VERIFY:
+        reason = s.reason  # the verdict's; what comes after it changes neither
     if s.mode == Mode.RELEASE:
-        return _enter(s, time, s.after_release, s.reason if s.verdict else reason)
+        return _enter(s, time, s.after_release, reason)
     if s.mode == Mode.FOLD:
         nothing_turned = Mode.TURN not in s.entered  # then there is nothing to verify
-        return _enter(s, time, Mode.RETREAT if nothing_turned else Mode.VERIFY, s.reason if s.verdict else reason)
+        return _enter(s, time, Mode.RETREAT if nothing_turned else Mode.VERIFY, reason)
     if s.mode == Mode.RETREAT:
         return _enter(s, time, Mode.DONE if s.verdict == Verdict.TURNED else Mode.FAILED, s.reason)
     turned = {"verdict": Verdict.TURNED} if s.mode == Mode.VERIFY else {}
