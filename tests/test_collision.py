@@ -21,7 +21,7 @@ STRAIGHT = dict.fromkeys(SIDES, np.array([0.0, 0, 1]))
 
 
 def stances(config: StanceConfig) -> Stances:
-    return Stances(ROBOT, MARKER, config, STRAIGHT, lambda X_BV, q: True)
+    return Stances(ROBOT, MARKER, config, STRAIGHT, lambda *_: True)
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,9 @@ def model():
 def X_BV():
     X_OV = compose(panel_pose(ValveConfig(height=1.0)), make(np.eye(3), np.array([0, 0, -MARKER.panel_depth])))
     config = StanceConfig(distance_min=0.7, distance_max=0.78)
-    base, margin = stances(config).find(X_OV, np.pi / 2)
+    place, margin = stances(config).find(X_OV, np.pi / 2)
     assert margin > 0.5
-    return compose(inverse(planar(*base)), X_OV)
+    return compose(inverse(planar(*place.base)), X_OV)
 
 
 def arms(X_BV: np.ndarray, *, back: float = 0.0, aside=(0.0, 0.0, 0.0)) -> np.ndarray:

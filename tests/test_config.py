@@ -220,7 +220,7 @@ def test_the_longest_search_for_a_stance_that_a_scenario_allows_ends_soon():
     X_OV = make(rot_y(math.pi / 2) @ rot_x(-math.pi / 2) @ np.eye(3), np.array([2.0, 0, 1.0]))
     straight = {side: np.array([0.0, 0, 1.0]) for side in SIDES}
     begin = time.process_time()
-    Stances(ROBOT, Marker(), longest, straight, lambda X_BV, q: True).find(X_OV, 6.29)
+    Stances(ROBOT, Marker(), longest, straight, lambda *_: True).find(X_OV, 6.29)
     assert time.process_time() - begin < 5.0  # 40 distances x 2 x 64 poses x 2 arms at worst
 
 

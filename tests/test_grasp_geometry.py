@@ -36,12 +36,14 @@ def valve_at(height: float, tilt: float = 0.0, bar: float = 0.0, *, yaw: float =
     return turned(compose(planar(2.0, 0.4, 0.0), X_WP, X_PV), np.deg2rad(bar))
 
 
-def stances(is_free=lambda X_BV, q: True, **changes) -> Stances:
+def stances(is_free=lambda *_: True, **changes) -> Stances:
     return Stances(ROBOT, MARKER, dc.replace(CONFIG, **changes), VIEW, is_free)
 
 
 def stance(X_OV: np.ndarray, turn: float, **changes):
-    return stances(**changes).find(X_OV, np.deg2rad(turn))
+    place, margin = stances(**changes).find(X_OV, np.deg2rad(turn))
+    assert place.posture is None  # this robot has no lift
+    return place.base, margin
 
 
 # ---------------------------------------------------------------- the turn's sign

@@ -11,6 +11,7 @@ from robot_facts import ARMS_HOME as HOME
 from robot_facts import LIMITS, ROBOT
 
 from valve_drake import resources
+from valve_drake.behaviors import stance_planner
 from valve_drake.behaviors.grasp_geometry import (
     StanceConfig,
     Stances,
@@ -19,8 +20,16 @@ from valve_drake.behaviors.grasp_geometry import (
     standoff,
     turned,
 )
-from valve_drake.behaviors.kinematic_approach import NOT_OWNED, KinematicApproach, KinematicApproachConfig, Memory
+from valve_drake.behaviors.kinematic_approach import (
+    NOT_OWNED,
+    Inputs,
+    KinematicApproach,
+    KinematicApproachConfig,
+    Memory,
+)
 from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
+from valve_drake.behaviors.stance_planner import StancePlanner, StancePlannerConfig
+from valve_drake.behaviors.stance_planner_system import PERIOD, StancePlannerSystem
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
@@ -29,10 +38,13 @@ from valve_drake.messages import (
     SIDES,
     Cause,
     Command,
+    GraspPlan,
     HandleMark,
     HandleMarks,
     Mode,
     ModeState,
+    PathPlan,
+    PlanRequest,
     RectangleEstimate,
     RobotState,
     Status,
@@ -40,12 +52,16 @@ from valve_drake.messages import (
 )
 from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK
+from valve_drake.robot import description
 from valve_drake.robot.kinematics import OUTWARD
+from valve_drake.robot.robot import Robot
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
 from valve_drake.supervisor.supervisor import SupervisorConfig
 
 CONFIG = KinematicApproachConfig()
+PLANNER = StancePlannerConfig()
+PORTION = round(PERIOD / TICK)  # ticks between two portions of a search
 STANCE = StanceConfig(distance_min=0.70, distance_max=0.78)  # fewer places to try: quicker
 MARKER = Marker()
 TAUGHT = load_taught(resources.models() / "taught" / "hands.yaml")
@@ -65,14 +81,16 @@ def collision():
 
 @pytest.fixture(scope="module")
 def base():
-    return Stances(ROBOT, MARKER, STANCE, VIEW, lambda X_BV, q: True).find(X_OV, QUARTER)[0]
+    return Stances(ROBOT, MARKER, STANCE, VIEW, lambda *_: True).find(X_OV, QUARTER)[0].base
 
 
 class Bench:
     """Arms that follow at once, a head camera that sees the marker with some noise 8 times a second."""
 
-    def __init__(self, base: np.ndarray, is_free=lambda X_BV, q: True, *, arms: np.ndarray = HOME, config=CONFIG):
-        self.law = KinematicApproach(config, Stances(ROBOT, MARKER, STANCE, VIEW, is_free), AREA)
+    def __init__(self, base: np.ndarray, is_free=lambda *_: True, *, arms: np.ndarray = HOME, config=CONFIG):
+        self.law = KinematicApproach(config, ROBOT, AREA)
+        self.planner = StancePlanner(PLANNER, Stances(ROBOT, MARKER, STANCE, VIEW, is_free))
+        self.planned = stance_planner.Memory()
         self.base, self.X_OV, self.axis_known = base, X_OV, True
         self.rng = np.random.default_rng(0)
         self.noise = np.array([0.002] * 3 + [0.001] * 3)  # of an estimate [rad, m]
@@ -107,10 +125,11 @@ class Bench:
             left_arm=self.arms[:6],
             right_arm=self.arms[6:],
         )
-        self.memory, self.command = self.law.step(
-            self.time, self.memory, state, mode, self.estimate, self.marks, self.turn
-        )
-        self.memory = self.law.watch_stance(self.time, self.memory, mode, self.estimate)
+        answers = self.planned.grasps, self.planned.path
+        inputs = Inputs(state, mode, self.estimate, self.marks, self.turn, *answers)
+        self.memory, self.command = self.law.step(self.time, self.memory, inputs)
+        if self.tick % PORTION == 0:
+            self.planned = self.planner.step(self.time, self.planned, mode, self.estimate, self.memory.request)
         if self.command.left_arm is not None:
             self.arms = np.concatenate([self.command.left_arm, self.command.right_arm])
             self.commands.append(self.arms)
@@ -190,7 +209,7 @@ def test_in_contact_and_at_the_end_the_arms_belong_to_others_and_the_next_motion
 def test_the_stance_is_the_best_place_for_what_is_seen(base):
     bench = Bench(np.array([0.1, -0.2, 0.1]))
     bench.run(Mode.FINE_APPROACH, limit=0.2)
-    stance = bench.memory.stance
+    stance = bench.planned.stance
     assert stance.found and stance.margin > 0.5
     assert stance.base == pytest.approx(base, abs=0.025)  # within a step of the search and the noise
     assert stance.time == 5.0  # of the image, not of the moment
@@ -199,35 +218,35 @@ def test_the_stance_is_the_best_place_for_what_is_seen(base):
 def test_the_stance_is_renewed_from_the_latest_looks():
     bench = Bench(np.array([0.1, -0.2, 0.1]))
     seen = []
-    bench.run(Mode.FINE_APPROACH, limit=3 * CONFIG.stance_period + 0.2, each=lambda b: seen.append(b.memory.stance))
+    bench.run(Mode.FINE_APPROACH, limit=3 * PLANNER.period + 0.2, each=lambda b: seen.append(b.planned.stance))
     times = sorted({s.time for s in seen if s.found})
-    assert np.diff(times) == pytest.approx([CONFIG.stance_period] * 3, abs=1.1 * IMAGE * TICK)
+    assert np.diff(times) == pytest.approx([PLANNER.period] * 3, abs=1.1 * IMAGE * TICK)
     bench.X_OV = make(X_OV[:, :3], X_OV[:, 3] + [0.10, 0, 0])  # the odometry has slipped
-    before = bench.memory.stance.base
-    bench.run(Mode.FINE_APPROACH, limit=3.2 * CONFIG.stance_period)
-    assert bench.memory.stance.base - before == pytest.approx([0.10, 0, 0], abs=0.03)
+    before = bench.planned.stance.base
+    bench.run(Mode.FINE_APPROACH, limit=3.2 * PLANNER.period)
+    assert bench.planned.stance.base - before == pytest.approx([0.10, 0, 0], abs=0.03)
 
 
 def test_a_valve_out_of_reach_has_no_stance_and_says_so():
     bench = Bench(np.array([0.1, -0.2, 0.1]))
     bench.X_OV = make(X_OV[:, :3], X_OV[:, 3] + [0, 0, 0.8])
     bench.run(Mode.FINE_APPROACH, limit=0.2)
-    assert not bench.memory.stance.found
-    assert "no stance" in bench.memory.stance.reason and "margin" in bench.memory.stance.reason
+    assert not bench.planned.stance.found
+    assert "no stance" in bench.planned.stance.reason and "margin" in bench.planned.stance.reason
 
 
 def test_without_a_marker_there_is_no_stance_and_a_search_forgets_the_old_one():
     bench = Bench(np.array([0.1, -0.2, 0.1]))
     bench.seen = False
     bench.run(Mode.FINE_APPROACH, limit=0.3)
-    assert not bench.memory.stance.found
+    assert not bench.planned.stance.found
     bench.seen = True
     bench.run(Mode.FINE_APPROACH, limit=0.3)
-    assert bench.memory.stance.found
+    assert bench.planned.stance.found
     bench.run(Mode.ROUGH_APPROACH, limit=0.1)
-    assert bench.memory.stance.found
+    assert bench.planned.stance.found
     bench.run(Mode.SEARCH, limit=0.1)
-    assert not bench.memory.stance.found
+    assert not bench.planned.stance.found
 
 
 # ---------------------------------------------------------------- measure
@@ -284,8 +303,8 @@ def test_a_base_that_stands_wrong_asks_for_another_stance(base):
     status = bench.run(Mode.MEASURE)
     assert (status.state, status.verdict) == ("failed", "reach_limit")
     assert status.cause == Cause.STANCE  # drive again
-    assert bench.memory.stance.found
-    assert bench.memory.stance.base == pytest.approx(base, abs=0.025)
+    bench.run(Mode.FINE_APPROACH, limit=0.5)
+    assert bench.planned.stance.base == pytest.approx(base, abs=0.025)
 
 
 @pytest.mark.parametrize(("waist", "state"), [(0.004, "succeeded"), (0.006, "failed"), (-0.3, "failed")])
@@ -349,7 +368,9 @@ def test_one_large_mark_is_not_enough(base, left, right):
 
 def test_a_blocked_standoff_fails_with_a_verdict_and_the_arms_stay(base):
     bench = Bench(base).measured()
-    bench.law.stances = dc.replace(bench.law.stances, is_free=lambda X_BV, q: bool(np.max(np.abs(q - HOME)) < 0.2))
+    bench.planner.stances = dc.replace(
+        bench.planner.stances, is_free=lambda X_BV, q, _=None: bool(np.max(np.abs(q - HOME)) < 0.2)
+    )
     status = bench.run(Mode.REACH)
     assert (status.state, status.verdict) == ("failed", "reach_limit")
     assert "no collision-free path" in status.detail
@@ -361,12 +382,12 @@ def test_a_way_round_an_obstacle_stays_within_the_joint_limits(base, detour):
     """The shortest way round leads through angles that the elbow does not have."""
     goal = []
 
-    def is_free(X_BV, q):
+    def is_free(X_BV, q, _=None):
         share = (q[0] - HOME[0]) / (goal[0][0] - HOME[0]) if goal else 0.0
         return not 0.35 < share < 0.65 or bool(q[2] < HOME[2] - detour)  # J3 is -1.9 at home; its limit is -2.62
 
     bench = Bench(base, is_free).measured()
-    goal.append(bench.law._standoff_joints(bench.memory.plan))
+    goal.append(bench.memory.plan.q_standoff)
     status = bench.run(Mode.REACH, limit=20)
     assert status.state == "succeeded", status.detail
     assert min(q[2] for q in bench.commands) <= HOME[2] - detour + 0.05  # it did go round
@@ -376,7 +397,7 @@ def test_a_way_round_an_obstacle_stays_within_the_joint_limits(base, detour):
 # ---------------------------------------------------------------- verify
 
 
-def verify(base, true: float, hands: float, commanded: float = QUARTER, *, is_free=lambda X_BV, q: True, known=True):
+def verify(base, true: float, hands: float, commanded: float = QUARTER, *, is_free=lambda *_: True, known=True):
     bench = Bench(base, is_free).at_standoff()
     bench.turn = TurnState(angle=hands)
     bench.X_OV = turned(X_OV, true)
@@ -430,7 +451,7 @@ def test_a_rectangle_that_looks_alike_after_part_of_a_turn_is_counted_by_the_han
 
 def test_the_way_home_keeps_clear_of_the_valve_as_the_hands_left_it(base):
     asked = []
-    bench, _ = verify(base, 0.6, 0.58, 0.6, is_free=lambda X_BV, q: not asked.append(X_BV))
+    bench, _ = verify(base, 0.6, 0.58, 0.6, is_free=lambda X_BV, q, _=None: not asked.append(X_BV))
     assert angle_turned(bench.memory.plan.X_BV, asked[-1]) == pytest.approx(0.58)
     assert angle_turned(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.0)  # on the way there
 
@@ -438,7 +459,7 @@ def test_the_way_home_keeps_clear_of_the_valve_as_the_hands_left_it(base):
 @pytest.mark.parametrize("mode", [Mode.RETREAT, Mode.IDLE, Mode.SEARCH])
 def test_an_early_retreat_or_a_reset_at_the_valve_keeps_clear_of_it_too(base, mode):
     asked = []
-    bench = Bench(base, lambda X_BV, q: not asked.append(X_BV)).at_standoff()
+    bench = Bench(base, lambda X_BV, q, _=None: not asked.append(X_BV)).at_standoff()
     bench.turn = TurnState(angle=0.4)
     bench.run(Mode.STOPPED, limit=0.1)
     asked.clear()
@@ -455,9 +476,9 @@ def test_an_early_retreat_or_a_reset_at_the_valve_keeps_clear_of_it_too(base, mo
 def test_where_the_straight_line_is_blocked_the_hands_move_straight_back_from_the_valve(base, homewards):
     """From the handles home, and to the stand-off: by way of a place further back, not by a search."""
     bench = Bench(base).at_standoff()
-    at_valve, X_BV = bench.arms, bench.memory.plan.X_BV
+    at_valve = bench.arms
     start, goal = (at_valve, HOME) if homewards else (HOME, at_valve)
-    vias = bench.law._vias(start, goal, X_BV)
+    vias = bench.planner.vias(start, goal)
     assert len(vias) == 3
     for via, back in zip(vias, (0.10, 0.16, 0.22)):
         for k, side in enumerate(SIDES):
@@ -466,8 +487,8 @@ def test_where_the_straight_line_is_blocked_the_hands_move_straight_back_from_th
             assert moved == pytest.approx([0, OUTWARD[side] * back / 2, 0], abs=2e-6)  # and a little outwards
             assert X1[:, :3] == pytest.approx(X0[:, :3], abs=2e-6)
     middle = (start + goal) / 2
-    free = lambda X_BV, q: bool(np.abs(q - middle).max() > 0.08)  # noqa: E731
-    bench.law.stances = dc.replace(bench.law.stances, is_free=free)
+    free = lambda X_BV, q, _=None: bool(np.abs(q - middle).max() > 0.08)  # noqa: E731
+    bench.planner.stances = dc.replace(bench.planner.stances, is_free=free)
     bench.run(Mode.IDLE, limit=0.1)
     bench.memory = dc.replace(bench.memory, q=start, path=None)
     bench.run(Mode.FOLD if homewards else Mode.REACH)
@@ -476,7 +497,7 @@ def test_where_the_straight_line_is_blocked_the_hands_move_straight_back_from_th
 
 def test_no_way_home_fails_with_a_verdict(base):
     free = [True]
-    bench = Bench(base, lambda X_BV, q: free[0]).at_standoff()
+    bench = Bench(base, lambda X_BV, q, _=None: free[0]).at_standoff()
     free[0] = False
     status = bench.run(Mode.FOLD)
     assert (status.state, status.verdict) == ("failed", "reach_limit")
@@ -553,6 +574,8 @@ def rig(**inputs) -> Rig:
         "estimate": bench.look(),
         "marks": HandleMarks(),
         "turn": TurnState(),
+        "grasps": GraspPlan(),
+        "path": PathPlan(number=0, found=True, points=[*bench.arms, *HOME]),
     }
     return Rig(KinematicApproachSystem(bench.law), **fixed | inputs)
 
@@ -564,16 +587,17 @@ def test_ports():
         "estimate": "in abstract",
         "marks": "in abstract",
         "turn": "in abstract",
+        "grasps": "in abstract",
+        "path": "in abstract",
         "command": "out abstract",
         "status": "out abstract",
-        "stance": "out abstract",
         "plan": "out abstract",
+        "request": "out abstract",
     }
 
 
-def test_block_says_where_to_stand_and_sends_the_arms_home():
+def test_block_sends_the_arms_home():
     dut = rig().run(1.5)
-    assert dut.read("stance").found
     assert dut.read("command").left_arm == pytest.approx(HOME[:6])
     assert dut.read("status").state == "idle" and not dut.read("plan").found
 
@@ -584,14 +608,85 @@ def test_block_holds_its_outputs_between_updates():
 
 def test_block_clones_are_independent():
     change = {"mode": ModeState(mode="measure", activation=2)}
-    assert_clones_are_independent(rig, change, ("command", "status", "stance"))
+    assert_clones_are_independent(rig, change, ("command", "status"))
 
 
-def test_no_command_of_the_arms_waits_for_the_stance(monkeypatch):
+def planner_rig(**inputs) -> Rig:
     bench = Bench(np.array([0.1, -0.2, 0.1]))
-    monkeypatch.setattr(bench.law, "watch_stance", lambda time, memory, mode, estimate: memory)
-    bench.run(Mode.FINE_APPROACH, limit=3.0)
-    assert not bench.memory.stance.found and not bench.memory.stance_looks
-    monkeypatch.undo()
-    bench.run(Mode.FINE_APPROACH, limit=3.0)
-    assert bench.memory.stance.found
+    fixed = {
+        "mode": ModeState(mode="fine_approach", activation=1, turn_angle=QUARTER),
+        "estimate": bench.look(),
+        "request": PlanRequest(),
+    }
+    return Rig(StancePlannerSystem(bench.planner), **fixed | inputs)
+
+
+def test_ports_of_the_planner():
+    assert ports(planner_rig().block) == {
+        "mode": "in abstract",
+        "estimate": "in abstract",
+        "request": "in abstract",
+        "stance": "out abstract",
+        "grasps": "out abstract",
+        "path": "out abstract",
+    }
+
+
+def test_the_planner_says_where_to_stand():
+    dut = planner_rig().run(0.5)
+    assert dut.read("stance").found and dut.read("stance").posture == pytest.approx(ROBOT.posture.home)
+
+
+def test_the_planners_clones_are_independent():
+    request = PlanRequest(number=0, kind="path", start=HOME, goal=HOME + 0.1)
+    change = {"mode": ModeState(mode="measure", activation=2), "request": request}
+    assert_clones_are_independent(planner_rig, change, ("path", "stance"))
+
+
+def test_a_search_is_cut_into_portions_and_a_request_comes_between_them():
+    """One place to stand at in each; while a stance is searched a path is found, and then the search goes on."""
+    bench = Bench(np.array([0.1, -0.2, 0.1]))
+    planner, mode = bench.planner, ModeState(mode="fine_approach", activation=1, turn_angle=QUARTER)
+    m = planner.step(0.0, stance_planner.Memory(), mode, bench.look(), PlanRequest())
+    assert m.search.index == 1 and not m.stance.found
+    request = PlanRequest(number=0, kind="path", start=HOME, goal=HOME + 0.1)
+    portions = 0
+    while m.path.number < 0:
+        m = planner.step(0.1, m, mode, RectangleEstimate(), request)
+        portions += 1
+    assert portions == 2 and m.path.points.tolist() == [*HOME, *HOME + 0.1]
+    assert m.search.index == 1
+    m = planner.step(0.2, m, mode, RectangleEstimate(), request)
+    assert m.search.index == 2
+
+
+def test_arms_wait_for_their_path_and_hold_still(base):
+    bench = Bench(base, arms=HOME + 0.1)
+    mode = ModeState(mode="search", activation=1)
+    state = RobotState(odometry=[*base, 0, 0], left_arm=bench.arms[:6], right_arm=bench.arms[6:])
+    nothing = RectangleEstimate(), HandleMarks(), TurnState(), GraspPlan()
+    m, command = bench.law.step(5.0, Memory(), Inputs(state, mode, *nothing, PathPlan()))
+    assert m.request.kind == "path" and m.phase == "planning" and m.request.goal == pytest.approx(HOME)
+    for _ in range(5):
+        m, command = bench.law.step(5.1, m, Inputs(state, mode, *nothing, PathPlan()))
+        assert command.left_arm == pytest.approx(bench.arms[:6]) and m.phase == "planning"
+    path = PathPlan(number=m.request.number, found=True, points=[*bench.arms, *HOME])
+    m, command = bench.law.step(5.2, m, Inputs(state, mode, *nothing, path))
+    assert m.phase == "moving"
+
+
+def test_the_lift_is_chosen_where_the_arms_alone_do_not_reach(tmp_path):
+    lifted = Robot.load(description.find("pr2/pr2.robot.yaml"))
+    stances = Stances(lifted, MARKER, STANCE, VIEW, lambda *_: True)
+    places = stances.begin(X_OV, QUARTER).places
+    assert len(places) == 2 and all(place.posture is None for place in places[0])
+    heights = sorted({float(place.posture[0]) for place in places[1]})
+    low, high = lifted.posture.low[0], lifted.posture.high[0]
+    assert heights[-1] == pytest.approx(high) and np.diff(heights).max() <= STANCE.lift_step + 1e-9
+    assert lifted.posture.home[0] == pytest.approx(low) or heights[0] == pytest.approx(low)
+    raised = places[1][-1].posture
+    X_BV = compose(inverse(planar(*places[0][0].base)), X_OV)
+    low_arc = stances.check_arc(X_BV, 0.3, False)
+    up = make(X_BV[:, :3], X_BV[:, 3] + [0, 0, raised[0] - lifted.posture.home[0]])
+    high_arc = stances.check_arc(up, 0.3, False, posture=raised)
+    assert high_arc.margin == pytest.approx(low_arc.margin, abs=1e-3)  # the valve and the shoulders are as high

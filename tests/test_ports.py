@@ -302,22 +302,6 @@ def test_an_error_of_who_is_read_is_not_taken_for_a_port_without_a_value():
         Simulator(builder.Build()).AdvanceTo(TICK)
 
 
-def test_what_can_wait_runs_in_slot_3_on_what_the_step_left_and_only_where_it_is_written():
-    class Planner(Counter):
-        def later(self, time, inputs, memory):
-            return memory + 10, {"report": StereoPosition(time=time, sequence=memory)}
-
-    rig = Rig(Planner())
-    rig.run(SLOT * 2.9)
-    assert rig.read("report").sequence == 0 and rig.block.memory(rig.context) == 1
-    rig.run(SLOT * 3.1)
-    assert rig.read("report").sequence == 1 and rig.read("report").time == 3 * SLOT
-    assert rig.block.memory(rig.context) == 11
-    plain = Rig(Counter())
-    plain.run(TICK)
-    assert plain.block.memory(plain.context) == 1
-
-
 # ---------------------------------------------------------------- blocks that sleep
 
 

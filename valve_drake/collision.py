@@ -13,7 +13,7 @@ FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the val
 
 
 class CollisionModel:
-    """Robot at the base's origin with lift, waist and head at home, and a valve that can be put anywhere.
+    """Robot at the base's origin with its head at home, and a valve that can be put anywhere.
 
     ignored: pairs of links that may touch, since they do at home (robot.yaml's `collision.ignore`).
     clearance: least distance that counts as free; a larger one forbids poses near the valve [m]; None: the robot's.
@@ -28,6 +28,7 @@ class CollisionModel:
         self._clearance = robot.description.collision.padding if clearance is None else clearance
         self._panel_depth = marker.panel_depth
         self._arms = robot.slots([name for side in SIDES for name in robot.arms[side].names])
+        self._posture = robot.slots(robot.posture.names)
         self._rest = robot.rest(robot.opening if opening is None else opening)
         self.ignored: set[tuple[str, str]] = set()
         if robot.description.collision.ignore:
@@ -48,11 +49,13 @@ class CollisionModel:
             both = GeometrySet(pair.id_A), GeometrySet(pair.id_B)
             filters.Apply(CollisionFilterDeclaration().ExcludeBetween(*both))
 
-    def _pose(self, X_BV: np.ndarray | None, q: np.ndarray) -> QueryObject:
+    def _pose(self, X_BV: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None) -> QueryObject:
         """Poses the model and returns the geometry query for it."""
         plant, context = self._plant, self._context
         positions = self._rest.copy()
         positions[self._arms] = q
+        if posture is not None:
+            positions[self._posture] = posture
         plant.SetPositions(context, positions)
         X_BP = FAR if X_BV is None else compose(X_BV, make(np.eye(3), np.array([0, 0, self._panel_depth])))
         frame = plant.GetFrameByName("valve_axis", self._valve)
@@ -61,9 +64,12 @@ class CollisionModel:
         plant.SetFreeBodyPose(context, frame.body(), X)
         return self._scene_graph.get_query_output_port().Eval(self._scene_graph.GetMyContextFromRoot(self._root))
 
-    def is_free(self, X_BV: np.ndarray | None, q: np.ndarray) -> bool:
-        """True if no two bodies are nearer than the clearance. X_BV: marker in the base (None: no valve); q: arms."""
-        return len(self._near(X_BV, q)) == 0
+    def is_free(self, X_BV: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None) -> bool:
+        """True if no two bodies are nearer than the clearance.
+
+        X_BV: marker in the base (None: no valve); q: both arms; posture: lift and waist (None: at home).
+        """
+        return len(self._near(X_BV, q, posture)) == 0
 
     def touching(self, X_BV: np.ndarray | None, q: np.ndarray) -> list[str]:
         """Names of the pairs that are nearer than the clearance, for messages."""
@@ -71,9 +77,11 @@ class CollisionModel:
         pairs = self._near(X_BV, q)
         return [f"{name(p.id_A)} - {name(p.id_B)}: {1e3 * p.distance:.0f} mm" for p in pairs]
 
-    def _near(self, X_BV: np.ndarray | None, q: np.ndarray) -> list[SignedDistancePair]:
+    def _near(
+        self, X_BV: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None
+    ) -> list[SignedDistancePair]:
         """All pairs of shapes that are nearer than the clearance."""
-        pairs: list[SignedDistancePair] = self._pose(X_BV, q).ComputeSignedDistancePairwiseClosestPoints(
+        pairs: list[SignedDistancePair] = self._pose(X_BV, q, posture).ComputeSignedDistancePairwiseClosestPoints(
             self._clearance
         )
         return pairs

@@ -23,6 +23,8 @@ from valve_drake.behaviors.image_servo import ImageServo
 from valve_drake.behaviors.image_servo_system import ImageServoSystem
 from valve_drake.behaviors.kinematic_approach import KinematicApproach
 from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
+from valve_drake.behaviors.stance_planner import StancePlanner
+from valve_drake.behaviors.stance_planner_system import StancePlannerSystem
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.behaviors.valve_search import ValveSearchConfig
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
@@ -80,7 +82,11 @@ WIRES: tuple[tuple[str, str], ...] = (
     ("handle_marker.marks", "kinematic_approach.marks"),
     ("handle_marker.marks", "image_servo.marks"),
     # between behaviours: where to stand, what to grasp, how far it was turned
-    ("kinematic_approach.stance", "base_approach.stance"),
+    ("rectangle_estimator.estimate", "stance_planner.estimate"),
+    ("stance_planner.stance", "base_approach.stance"),
+    ("kinematic_approach.request", "stance_planner.request"),
+    ("stance_planner.grasps", "kinematic_approach.grasps"),
+    ("stance_planner.path", "kinematic_approach.path"),
     ("kinematic_approach.plan", "hybrid_rotation.plan"),
     ("hybrid_rotation.turn", "kinematic_approach.turn"),
     # all commands reach the robot through command_selector
@@ -93,7 +99,14 @@ WIRES: tuple[tuple[str, str], ...] = (
     ("command_selector.report", "supervisor.selector"),
     *(
         ("supervisor.mode", f"{block}.mode")
-        for block in ("color_segmentation", "rectangle_estimator", "handle_marker", *BEHAVIORS, "command_selector")
+        for block in (
+            "color_segmentation",
+            "rectangle_estimator",
+            "handle_marker",
+            "stance_planner",
+            *BEHAVIORS,
+            "command_selector",
+        )
     ),
 )
 
@@ -223,7 +236,8 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             robot.waist,
         ),
         BaseApproachSystem(scenario.base_approach, marker),
-        KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, stances, area)),
+        StancePlannerSystem(StancePlanner(scenario.stance_planner, stances)),
+        KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, robot, area)),
         ImageServoSystem(ImageServo(scenario.image_servo, robot, taught)),
         HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, marker, robot, view)),
         CommandSelectorSystem(scenario.command_selector, initial_commands(scenario), robot.torso, robot.arms),

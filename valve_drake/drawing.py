@@ -19,6 +19,7 @@ PLACES: dict[str, tuple[float, float]] = {
     "stereo_positioning": (2, 0.4),
     "line_fitting": (2, 1.7),
     "rectangle_estimator": (3, 1.7),
+    "stance_planner": (3, 3.0),
     "valve_search": (4, 0.4),
     "base_approach": (4, 1.5),
     "kinematic_approach": (4, 2.6),

@@ -377,20 +377,48 @@ class Command(Message):
 
 
 @dc.dataclass(frozen=True, eq=False)
+class PlanRequest(Message):
+    """What kinematic_approach asks stance_planner for; a new `number` makes it a new question.
+
+    kind: "grasps": where both hands hold the valve at X_BV from here, for a turn by `turn_angle`;
+    "path": a collision-free way of both arms from `start` to `goal`, past the valve at X_BV.
+    """
+
+    number: int = -1
+    kind: str = ""
+    valve: bool = False  # there is a valve, at X_BV
+    X_BV: np.ndarray = transform()
+    turn_angle: float = 0.0  # positive opens [rad]
+    start: np.ndarray = array(-1)  # both arms, left first [rad]
+    goal: np.ndarray = array(-1)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class PathPlan(Message):
+    """The answer to a PlanRequest for a path: way points of both arms, left first."""
+
+    number: int = -1
+    found: bool = False
+    points: np.ndarray = array(-1)  # N of them, one after the other (N * n,) [rad]
+
+
+@dc.dataclass(frozen=True, eq=False)
 class GraspPlan(Message):
-    """What kinematic_approach measured at rest and plans: the valve in the base, and the grasps.
+    """The answer to a PlanRequest for grasps; kinematic_approach adds what it measured and passes it on.
 
     A hand's pose in V is constant while the valve turns, since V turns with it. `swapped`: the left hand
     takes the handle at +x of V instead of -x.
     """
 
     time: float = -1.0
+    number: int = -1
     found: bool = False
     X_BV: np.ndarray = transform()
     covariance: np.ndarray = array(6, 6)  # of X_BV, as in RectangleEstimate with L replaced by B
     swapped: bool = False
     X_BG_left: np.ndarray = transform()  # grasps
     X_BG_right: np.ndarray = transform()
+    q_standoff: np.ndarray = array(-1)  # both arms at the stand-offs before the grasps, left first [rad]
     margin: float = 0.0  # least arm margin over the whole turn, 1 is comfortable
 
 
@@ -435,6 +463,7 @@ class Stance(Message):
     time: float = -1.0  # capture time of the estimate that it was computed from [s]
     found: bool = False
     base: np.ndarray = array(3)  # x, y [m], heading [rad] in O
+    posture: np.ndarray = array(-1)  # lift and waist, if there are [m, rad]
     margin: float = 0.0  # smallest normalised joint margin on the way, 0..1
     reason: str = ""
 

@@ -23,8 +23,8 @@ after one tick and no two blocks that feed each other run at the same instant:
     slot 2  command_selector; the simulated plant, by the commands of the tick before
     slot 3  supervisor, perception, and the station's wrench sensors, all for the next tick
 
-Commands are published when slot 3 begins. Slow work (perception, and stance planning: `later`) therefore runs in
-slot 3 and cannot delay them.
+Commands are published when slot 3 begins. Slow work (perception and planning) therefore runs in slot 3 and cannot
+delay them; what takes longer than a tick is cut into portions (stance_planner).
 
 Every block uses UNRESTRICTED updates: Drake makes them all from the state before any of them. A discrete update, made
 afterwards, would see what the other blocks have made of the same instant.
@@ -203,8 +203,6 @@ class Block(PythonSystem, Generic[In, M]):
         self.schedule: list[tuple[float, float, Step]] = [
             (period, slot * SLOT + delay, self.step)
         ]  # period, offset [s]
-        if type(self).later is not Block.later:
-            self.schedule.append((period, 3 * SLOT + delay, self.later))
         for every, offset, work in self.schedule:
             self.DeclarePeriodicUnrestrictedUpdateEvent(every, offset, functools.partial(self._update, work))
 
@@ -223,10 +221,6 @@ class Block(PythonSystem, Generic[In, M]):
         """One step: new memory, and the outputs that change (those left out keep their value)."""
         raise NotImplementedError(f"{type(self).__name__}.step")  # abstract
 
-    def later(self, time: float, inputs: In, memory: M) -> tuple[M, Outputs]:
-        """A second step in slot 3, for slow work that no command of this tick needs; runs only where it is written."""
-        return memory, {}
-
     def memory(self, context: Context) -> M:
         """The memory in this Context, for tests and reports."""
         held: Held = context.get_abstract_state(self._memory).get_value()
@@ -236,7 +230,7 @@ class Block(PythonSystem, Generic[In, M]):
     def update(
         self, work: "Step", time: float, sources: "Mapping[str, Source]", where: Any, held: "Held"
     ) -> "tuple[Held, Outputs] | None":
-        """One step, `step` or `later`, on the ports `sources` evaluated in `where`; None while the block sleeps."""
+        """One step on the ports `sources` evaluated in `where`; None while the block sleeps."""
         inputs = self._inputs(sources, where)
         activation = None
         if self.AWAKE is not None:

@@ -18,6 +18,7 @@ from valve_drake.behaviors.grasp_geometry import StanceConfig
 from valve_drake.behaviors.hybrid_rotation import HybridRotationConfig
 from valve_drake.behaviors.image_servo import ImageServoConfig
 from valve_drake.behaviors.kinematic_approach import KinematicApproachConfig
+from valve_drake.behaviors.stance_planner import StancePlannerConfig
 from valve_drake.behaviors.valve_search import ValveSearchConfig
 from valve_drake.checks import ConfigError, require, shown
 from valve_drake.config import Config, Uniform, choice, number, plain
@@ -53,6 +54,7 @@ RETIRED = (
     "image_servo.opening",
     "kinematic_approach.home",
     "kinematic_approach.opening",
+    "kinematic_approach.stance_period",
     *(
         f"handle_marker.segmentation.{name}"
         for name in ("min_opponent", "min_green_area", "min_fill", "border", "follow", "full_every", "every")
@@ -82,6 +84,7 @@ class Scenario(Config):
     valve_search: ValveSearchConfig = dc.field(default_factory=ValveSearchConfig)
     base_approach: BaseApproachConfig = dc.field(default_factory=BaseApproachConfig)
     stance: StanceConfig = dc.field(default_factory=StanceConfig)
+    stance_planner: StancePlannerConfig = dc.field(default_factory=StancePlannerConfig)
     kinematic_approach: KinematicApproachConfig = dc.field(default_factory=KinematicApproachConfig)
     image_servo: ImageServoConfig = dc.field(default_factory=ImageServoConfig)
     hybrid_rotation: HybridRotationConfig = dc.field(default_factory=HybridRotationConfig)

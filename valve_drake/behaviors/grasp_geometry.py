@@ -5,7 +5,8 @@ turns, since V turns with it. Turning by theta (positive opens, about -z of V): 
 """
 
 import dataclasses as dc
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 
@@ -35,7 +36,9 @@ class StanceConfig(Config):
     arc_step: float = number(
         0.27, 0.1, 1.0, "between two angles of the turn that are checked; halving it doubles the search [rad]"
     )
+    lift_step: float = number(0.08, 0.01, 1.0, "between two heights of a lift that are tried [m]")
     margin_enough: float = number(0.9, 0.01, 1.0, "the search ends at the first stance with this arm margin")
+    margin_good: float = number(0.5, 0.01, 1.0, "with a stance of this arm margin no other height is tried")
     margin_min: float = number(0.15, 0.01, 1.0, "least arm margin that is accepted (1 is comfortable)")
 
     def relations(self, key: str) -> None:
@@ -77,9 +80,45 @@ class ArcCheck:
     margin: float
     swapped: bool
     q: Mapping[str, np.ndarray] = dc.field(default_factory=dict)  # side -> (n,); empty if the turn is out of reach
+    q_standoff: Mapping[str, np.ndarray] = dc.field(default_factory=dict)  # the same at the stand-off before it
 
 
 JUMP = 1.0  # a joint that moves so far between two angles of the turn is on another branch [rad]
+
+
+class Free(Protocol):
+    """No contact and enough clearance with both arms at q, the valve at X_BV (None: no valve).
+
+    posture: lift and waist; None: at home.
+    """
+
+    def __call__(self, X_BV: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None) -> bool: ...
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Place:
+    """Where the robot may stand: base (x, y, heading) in O, posture (lift and waist; None: at home)."""
+
+    base: np.ndarray
+    posture: np.ndarray | None = None
+
+
+@dc.dataclass(frozen=True, eq=False)
+class StanceSearch:
+    """A search for a stance, cut into portions of one place each: `Stances.advance` makes the next one.
+
+    places: by group; the search ends with a place of `margin_enough`, or after a group that has one of `margin_good`.
+    """
+
+    X_OV: np.ndarray
+    turn_angle: float
+    places: tuple[tuple[Place, ...], ...]
+    group: int = 0
+    index: int = 0  # of the next place in its group
+    arc: ArcCheck | None = None  # of the place before, to start from
+    best: Place | None = None
+    margin: float = -1.0  # of `best`
+    done: bool = False
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -87,14 +126,13 @@ class Stances:
     """Which turns the hands can follow, and from where.
 
     view: each wrist camera's view direction in its hand's frame (from the taught reference).
-    is_free(X_BV, q): no contact and enough clearance with both arms at q, the valve at X_BV (None: no valve).
     """
 
     robot: RobotKinematics
     marker: Marker
     config: StanceConfig
     view: Mapping[str, np.ndarray]
-    is_free: Callable[[np.ndarray | None, np.ndarray], bool]
+    is_free: Free
 
     def check_arc(
         self,
@@ -103,10 +141,11 @@ class Stances:
         swapped: bool,
         near: Mapping[str, np.ndarray] | None = None,
         least: float = 0.0,
+        posture: np.ndarray | None = None,
     ) -> ArcCheck:
         """Whether both hands can hold their handles all along the turn, and draw back from them at both ends.
 
-        X_BV: marker in the base, lift and waist at home. near: joints of a like arc's start, by side.
+        X_BV: marker in the base. near: joints of a like arc's start, by side. posture: lift and waist; None: at home.
         least: the check ends where the margin falls to it: whoever asks knows a better arc.
         Unless the arms are free of all at the turn's start, middle and end, the margin is -1.
         """
@@ -115,38 +154,45 @@ class Stances:
         angles = np.linspace(0.0, turn_angle, count)
         margin = 1.0
         arcs: dict[str, list[np.ndarray]] = {side: [] for side in SIDES}
+        q_standoff: dict[str, np.ndarray] = {}
         for side in SIDES:
             X_VG = hand_in_valve(side, swapped, self.marker)
             q_last = near.get(side) if near else None
             for k, angle in enumerate(angles):
                 X_BG = compose(turned(X_BV, angle), X_VG)
                 start = q_last if k < 2 else 2 * arcs[side][-1] - arcs[side][-2]  # goes on as before
-                q = robot.inverse(side, X_BG, start)
+                q = robot.inverse(side, X_BG, start, posture)
                 if q is None and k == 0 and q_last is not None:
-                    q = robot.inverse(side, X_BG)
+                    q = robot.inverse(side, X_BG, posture=posture)
                 if q is None or (k > 0 and q_last is not None and np.max(np.abs(q - q_last)) > JUMP):
                     return out
                 margin = min(margin, robot.margin(side, q))
                 if k in (0, count - 1):
-                    back = robot.inverse(side, standoff(X_BG, self.view[side], self.config.standoff), q)
+                    back = robot.inverse(side, standoff(X_BG, self.view[side], self.config.standoff), q, posture)
                     if back is None:
                         return out
                     margin = min(margin, robot.margin(side, back))
+                    q_standoff.setdefault(side, back)
                 if margin <= least:
                     return ArcCheck(margin, swapped)
                 arcs[side].append(q)
                 q_last = q
         for k in (0, count // 2, count - 1):
             q_both = np.concatenate([arcs[side][k] for side in SIDES])
-            if not self.is_free(turned(X_BV, angles[k]), q_both):
+            if not self.is_free(turned(X_BV, angles[k]), q_both, posture):
                 return out
-        return ArcCheck(margin, swapped, {side: arcs[side][0] for side in SIDES})
+        return ArcCheck(margin, swapped, {side: arcs[side][0] for side in SIDES}, q_standoff)
 
     def best_arc(
-        self, X_BV: np.ndarray, turn_angle: float, near: ArcCheck | None = None, least: float = 0.0
+        self,
+        X_BV: np.ndarray,
+        turn_angle: float,
+        near: ArcCheck | None = None,
+        least: float = 0.0,
+        posture: np.ndarray | None = None,
     ) -> ArcCheck:
         """The assignment of the handles to the hands with which the arms do not cross; where that does not serve, the
-        better of the two by its margin. near: a like arc, to start from; least: as of `check_arc`."""
+        better of the two by its margin. near: a like arc, to start from; the rest: as of `check_arc`."""
         middle = turned(X_BV, turn_angle / 2)
         left = {
             swapped: compose(middle, hand_in_valve(LEFT, swapped, self.marker))[1, 3]
@@ -157,32 +203,61 @@ class Stances:
         best = ArcCheck(-1.0, orders[0])
         for swapped in orders:
             start = near.q if near is not None and near.swapped == swapped else None
-            arc = self.check_arc(X_BV, turn_angle, swapped, start, max(best.margin, least))
+            arc = self.check_arc(X_BV, turn_angle, swapped, start, max(best.margin, least), posture)
             if arc.margin > best.margin:
                 best = arc
             if best.margin >= self.config.margin_min:
                 break
         return best
 
-    def find(self, X_OV: np.ndarray, turn_angle: float) -> tuple[np.ndarray, float]:
-        """The nearest base pose (x, y, heading) in O, square to the panel, with a comfortable arm margin over the whole
-        turn; if there is none, the one with the largest margin.
+    # ------------------------------------------------------------ where to stand
+    def begin(self, X_OV: np.ndarray, turn_angle: float) -> StanceSearch:
+        """A search for the stance from which the valve at X_OV can be turned."""
+        return StanceSearch(X_OV, turn_angle, self._places(X_OV))
 
-        Returns (base (3,), margin); margin < 0 if there is no stance from which the hands reach.
-        """
+    def _places(self, X_OV: np.ndarray) -> tuple[tuple[Place, ...], ...]:
+        """Square to the panel, from near to far; first with the lift at home, then at other heights of it."""
         heading = float(np.arctan2(X_OV[1, 2], X_OV[0, 2]))  # of z_V, into the panel, on the floor
         forward = np.array([np.cos(heading), np.sin(heading)])
         axis_point = X_OV[:, 3] + self.marker.panel_depth * X_OV[:, 2]  # the stem at the panel
-        best, margin = np.zeros(3), -1.0
-        arc: ArcCheck | None = None
         c = self.config
-        for distance in np.arange(c.distance_min, c.distance_max + 1e-9, c.distance_step):
-            xy = axis_point[:2] - distance * forward
-            base = np.array([xy[0], xy[1], heading])
-            X_BV = compose(inverse(planar(*base)), X_OV)
-            arc = self.best_arc(X_BV, turn_angle, arc, max(margin, 0.0))
-            if arc.margin > margin:
-                best, margin = base, arc.margin
-            if margin >= c.margin_enough:
-                break
-        return best, margin
+        distances = np.arange(c.distance_min, c.distance_max + 1e-9, c.distance_step)
+        bases = [np.array([*(axis_point[:2] - distance * forward), heading]) for distance in distances]
+        groups = [tuple(Place(base) for base in bases)]
+        if raised := self._postures():
+            groups.append(tuple(Place(base, posture) for posture in raised for base in bases))
+        return tuple(groups)
+
+    def _postures(self) -> list[np.ndarray]:
+        """Other heights of the lift; none without one."""
+        joints, count = self.robot.posture, self.robot.lift
+        low, high, home = joints.low[:count], joints.high[:count], joints.home[:count]
+        if not count:
+            return []
+        steps = max(2, int(np.ceil(float(np.max(high - low)) / self.config.lift_step)) + 1)
+        raised = [low + share * (high - low) for share in np.linspace(0.0, 1.0, steps)]
+        return [np.concatenate([q, joints.home[count:]]) for q in raised if np.max(np.abs(q - home)) > 1e-3]
+
+    def advance(self, search: StanceSearch) -> StanceSearch:
+        """The search after its next place."""
+        c, s = self.config, search
+        place = s.places[s.group][s.index]
+        X_BV = compose(inverse(planar(*place.base)), s.X_OV)
+        arc = self.best_arc(X_BV, s.turn_angle, s.arc, max(s.margin, 0.0), place.posture)
+        best, margin = (place, arc.margin) if arc.margin > s.margin else (s.best, s.margin)
+        group, index = s.group, s.index + 1
+        if index == len(s.places[group]):
+            group, index = group + 1, 0
+        left = group < len(s.places) and (index > 0 or margin < c.margin_good)
+        done = margin >= c.margin_enough or not left
+        return dc.replace(s, group=group, index=index, arc=arc, best=best, margin=margin, done=done)
+
+    def find(self, X_OV: np.ndarray, turn_angle: float) -> tuple[Place, float]:
+        """The first place with a comfortable arm margin over the whole turn; if there is none, that with the largest.
+
+        Returns (place, margin); margin < 0 if there is no place from which the hands reach.
+        """
+        search = self.begin(X_OV, turn_angle)
+        while not search.done:
+            search = self.advance(search)
+        return search.best or Place(np.zeros(3)), search.margin

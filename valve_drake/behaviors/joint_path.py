@@ -1,6 +1,6 @@
 """Collision-free joint paths for both arms together, and their timing.
 
-`find_path` tries the straight line in joint space, then lines through given via poses, then RRT-Connect with
+A search tries the straight line in joint space, then lines through given via poses, then RRT-Connect with
 short-cuts; every sample is checked by the caller's `is_free(q (n,)) -> bool` (left arm, right arm).
 """
 
@@ -66,66 +66,112 @@ def line_is_free(a: np.ndarray, b: np.ndarray, is_free: Free) -> bool:
     return all(is_free(a + (b - a) * (k / count)) for k in order)
 
 
+@dc.dataclass(frozen=True)
+class PathSearch:
+    """A search for a path, cut into portions: `advance` makes the next one. Every portion is a few milliseconds' work.
+
+    First the straight line, then one via pose a portion, then one try of RRT-Connect, then short-cuts.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    vias: tuple[np.ndarray, ...] = ()
+    tries: int = 400  # of RRT-Connect
+    portion: int = 0
+    trees: "tuple[Tree, Tree]" = ((), ())  # from the start and from the goal
+    way: tuple[np.ndarray, ...] = ()  # what RRT-Connect has found, being shortened
+    cuts: int = 0  # pairs of its points that do not see each other
+    done: bool = False
+    points: np.ndarray | None = None  # (N, n), once found
+
+    def advance(self, is_free: Free) -> "PathSearch":
+        """The search after one more portion; the start need not be free: the robot is there."""
+        start, goal = self.start, self.goal
+
+        def free(q: np.ndarray) -> bool:
+            return bool(np.max(np.abs(q - start)) < LEAVE) or is_free(q)
+
+        k = self.portion
+        after = dc.replace(self, portion=k + 1)
+        if self.way:
+            return after._shorten(free)
+        if k == 0:
+            if not is_free(goal):
+                return dc.replace(after, done=True)
+            return after._found([start, goal]) if line_is_free(start, goal, free) else after
+        if k <= len(self.vias):
+            via = self.vias[k - 1]
+            straight = line_is_free(start, via, free) and line_is_free(via, goal, free)
+            return after._found([start, via, goal]) if straight else after
+        tried = k - len(self.vias) - 1
+        if tried >= self.tries:
+            return dc.replace(after, done=True)
+        return after._connect(tried, free)
+
+    def _found(self, points: Sequence[np.ndarray]) -> "PathSearch":
+        return dc.replace(self, done=True, points=np.array(points))
+
+    def _connect(self, tried: int, free: Free) -> "PathSearch":
+        """One try of RRT-Connect: a tree grows towards a random pose, the other one towards what it has reached."""
+        trees = self.trees if tried else (((self.start, -1),), ((self.goal, -1),))
+        grow, other = trees[tried % 2], trees[1 - tried % 2]
+        low, high = np.minimum(self.start, self.goal) - 0.8, np.maximum(self.start, self.goal) + 0.8
+        grown = _extend(grow, _random(tried).uniform(low, high), free, 0.4)
+        if grown is None:
+            return dc.replace(self, trees=trees)
+        joined = _extend(other, grown[-1][0], free, np.inf)
+        order = (grown, joined or other)
+        trees = order if tried % 2 == 0 else order[::-1]
+        if joined is None:
+            return dc.replace(self, trees=trees)
+        return dc.replace(self, trees=trees, way=(*_branch(trees[0])[::-1], *_branch(trees[1])[1:]))
+
+    def _shorten(self, free: Free) -> "PathSearch":
+        """Leaves out way points that lie between two that see each other, the farthest apart first."""
+        way, cuts = self.way, self.cuts
+        for _ in range(4):
+            pairs = [(i, i + apart) for apart in range(len(way) - 1, 1, -1) for i in range(len(way) - apart)]
+            if cuts >= len(pairs):
+                return self._found(way)
+            i, j = pairs[cuts]
+            if line_is_free(way[i], way[j], free):
+                way, cuts = (*way[: i + 1], *way[j:]), 0
+            else:
+                cuts += 1
+        return dc.replace(self, way=way, cuts=cuts)
+
+
+Tree = tuple[tuple[np.ndarray, int], ...]  # nodes, each with the index of the one it grew from
+
+
 def find_path(
     start: np.ndarray, goal: np.ndarray, vias: Sequence[np.ndarray], is_free: Free, *, tries: int = 400
 ) -> np.ndarray | None:
-    """Way points (N, n) from start to goal, or None. The start need not be free: the robot is there."""
-    if not is_free(goal):
-        return None
-
-    def free(q: np.ndarray) -> bool:
-        return bool(np.max(np.abs(q - start)) < LEAVE) or is_free(q)
-
-    if line_is_free(start, goal, free):
-        return np.array([start, goal])
-    for via in vias:
-        if line_is_free(start, via, free) and line_is_free(via, goal, free):
-            return np.array([start, via, goal])
-    return _rrt_connect(start, goal, free, tries)
+    """Way points (N, n) from start to goal, or None: a PathSearch to its end."""
+    search = PathSearch(start, goal, tuple(vias), tries)
+    while not search.done:
+        search = search.advance(is_free)
+    return search.points
 
 
-def _rrt_connect(start: np.ndarray, goal: np.ndarray, is_free: Free, tries: int) -> np.ndarray | None:
-    rng = np.random.default_rng(0)  # the same problem gives the same path
-    low, high = np.minimum(start, goal) - 0.8, np.maximum(start, goal) + 0.8
-    trees: list[list[tuple[np.ndarray, int]]] = [[(start, -1)], [(goal, -1)]]
-    for k in range(tries):
-        grow, other = trees[k % 2], trees[1 - k % 2]
-        reached = _extend(grow, rng.uniform(low, high), is_free, 0.4)
-        if reached is None:
-            continue
-        joined = _extend(other, reached, is_free, np.inf)
-        if joined is not None and np.array_equal(joined, reached):
-            half = [_branch(grow), _branch(other)]
-            points = half[0][::-1] + half[1][1:]
-            return _shortcut(points if k % 2 == 0 else points[::-1], is_free, rng)
-    return None
+def _random(k: int) -> np.random.Generator:
+    """The same problem gives the same path."""
+    return np.random.Generator(np.random.SFC64(k))
 
 
-def _extend(tree: list[tuple[np.ndarray, int]], to: np.ndarray, is_free: Free, most: float) -> np.ndarray | None:
+def _extend(tree: Tree, to: np.ndarray, is_free: Free, most: float) -> Tree | None:
+    """The tree with one more node, at most `most` from its nearest one towards `to`; None if the way is blocked."""
     near = int(np.argmin([np.max(np.abs(q - to)) for q, _ in tree]))
     q = tree[near][0]
     reach = float(np.max(np.abs(to - q)))
     target = to if reach <= most else q + (to - q) * (most / reach)
-    if not line_is_free(q, target, is_free):
-        return None
-    tree.append((target, near))
-    return target
+    return (*tree, (target, near)) if line_is_free(q, target, is_free) else None
 
 
-def _branch(tree: list[tuple[np.ndarray, int]]) -> list[np.ndarray]:
+def _branch(tree: Tree) -> list[np.ndarray]:
     """From the newest node back to the root."""
     out, k = [], len(tree) - 1
     while k >= 0:
         out.append(tree[k][0])
         k = tree[k][1]
     return out
-
-
-def _shortcut(points: list[np.ndarray], is_free: Free, rng: np.random.Generator) -> np.ndarray:
-    for _ in range(60):
-        if len(points) < 3:
-            break
-        i, j = sorted(rng.choice(len(points), 2, replace=False))
-        if j > i + 1 and line_is_free(points[i], points[j], is_free):
-            points = points[: i + 1] + points[j:]
-    return np.array(points)

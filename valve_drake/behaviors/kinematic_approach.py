@@ -1,25 +1,28 @@
 """Stage 3: the arms by forward and inverse kinematics; and the measurements at rest before and after the turn.
 
 In each mode:
-    idle, search, approaches  holds the arms at home; fine_approach: computes the stance from every good estimate
-    measure   several frames at rest -> the valve's pose in the base and the grasps (GraspPlan)
+    idle, search, approaches  holds the arms at home
+    measure   several frames at rest -> the valve's pose in the base, and the grasps that stance_planner finds for it
     reach     a collision-free joint path of both arms to the stand-off before the handles, offset along the wrist
               cameras' view; ends on arrival, or before when both green marks are large enough in the wrist images
     fold      both arms home along a collision-free path
     verify    several frames at rest: the angle that the camera measures decides
     retreat   holds home
 
+Paths and grasps are searched by stance_planner: a request goes out (Memory.request), the arms stand still until its
+answer is there.
+
 Frames: frames.py. The base stands still from measure to verify.
 """
 
 import copy
 import dataclasses as dc
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from valve_drake.behaviors.grasp_geometry import Stances, angle_turned, hand_in_valve, standoff, turned
-from valve_drake.behaviors.joint_path import Path, find_path
+from valve_drake.behaviors.grasp_geometry import angle_turned, turned
+from valve_drake.behaviors.joint_path import Path
 from valve_drake.config import Config, number
 from valve_drake.frames import compose, inverse, planar, wrap
 from valve_drake.memory import changed
@@ -33,15 +36,16 @@ from valve_drake.messages import (
     HandleMarks,
     Mode,
     ModeState,
+    PathPlan,
+    PlanRequest,
     RectangleEstimate,
     RobotState,
-    Stance,
     Status,
     TurnState,
     Verdict,
 )
 from valve_drake.perception.fusion import fuse
-from valve_drake.robot.kinematics import OUTWARD, RobotKinematics
+from valve_drake.robot.kinematics import RobotKinematics
 from valve_drake.task.modes import TABLE
 
 
@@ -59,7 +63,6 @@ class KinematicApproachConfig(Config):
         0.9, 0.3, 1.5, "reaching ends early when sqrt(area) of both green marks is this share of the taught one"
     )
     gripper_force: float = number(40.0, 5.0, 100.0, "while opening [N]")
-    stance_period: float = number(0.5, 0.1, 10.0, "between two computations of the stance [s]")
     angle_tolerance: float = number(0.035, 0.002, 0.2, "camera angle against the command that counts as turned [rad]")
     still_rate: float = number(
         0.0017, 1e-4, 0.05, "a valve that turns slower stands still; its final angle is taken then [rad/s]"
@@ -84,9 +87,8 @@ class Memory:
     path: Path | None = None
     looks: tuple[RectangleEstimate, ...] = ()
     seen: int = -1  # sequence of the newest estimate used
-    stance_looks: tuple[RectangleEstimate, ...] = ()
-    stance: Stance = Stance()
-    stance_at: float = -1e9  # when it was computed [s]
+    covariance: np.ndarray = dc.field(default_factory=lambda: np.zeros((6, 6)))  # of the valve that was measured
+    request: PlanRequest = PlanRequest()  # the last one
     X_OV0: np.ndarray | None = None  # the valve before the turn
     plan: GraspPlan = GraspPlan()
     status: Status = Status()
@@ -100,6 +102,8 @@ class Inputs(NamedTuple):
     estimate: RectangleEstimate
     marks: HandleMarks
     turn: TurnState
+    grasps: GraspPlan  # the answers of stance_planner
+    path: PathPlan
 
 
 # Modes in which another block moves the arms; on return the commands start from the measured joints.
@@ -109,36 +113,19 @@ NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms
 
 
 class KinematicApproach:
-    """The mathematics of the stage.
+    """The mathematics of the stage. reference_area: of each green mark in the taught image [px^2]."""
 
-    stances: where the hands can turn the valve from; they hold robot, marker and view.
-    reference_area: of each green mark in the taught image [px^2].
-    """
-
-    def __init__(self, config: KinematicApproachConfig, stances: Stances, reference_area: dict[str, float]):
+    def __init__(self, config: KinematicApproachConfig, robot: RobotKinematics, reference_area: dict[str, float]):
         config.check()
-        stances.config.check()
-        stances.marker.check()
         self.config = copy.copy(config)
-        self.stances = dc.replace(
-            stances, config=copy.copy(stances.config), marker=copy.copy(stances.marker), view=dict(stances.view)
-        )
-        self.robot: RobotKinematics = stances.robot
+        self.robot = robot
         self.reference_area = reference_area
         self.home = self.robot.home
 
     # ------------------------------------------------------------ the step
-    def step(
-        self,
-        time: float,
-        memory: Memory,
-        state: RobotState,
-        mode: ModeState,
-        estimate: RectangleEstimate,
-        marks: HandleMarks,
-        turn: TurnState,
-    ) -> tuple[Memory, Command]:
-        """One tick -> new memory (with status, stance and plan in it), command. `watch_stance` follows it."""
+    def step(self, time: float, memory: Memory, inputs: Inputs) -> tuple[Memory, Command]:
+        """One tick -> new memory (with status, plan and request in it), command."""
+        state, mode, turn = inputs.state, inputs.mode, inputs.turn
         measured = np.concatenate([state.left_arm, state.right_arm])
         m = memory
         mine_again = m.activation < 0 or (mode.activation != m.activation and m.mode in NOT_OWNED)
@@ -156,11 +143,9 @@ class KinematicApproach:
             Mode.VERIFY: self._verify,
         }
         if mode.mode in run:
-            m = run[Mode(mode.mode)](time, m, Inputs(state, mode, estimate, marks, turn))
+            m = run[Mode(mode.mode)](time, m, inputs)
         else:
-            if mode.mode == Mode.SEARCH:
-                m = changed(m, stance=Stance(), stance_looks=())
-            m = self._homing(time, m, self._valve(m, state, turn) if m.phase == "start" else None)
+            m = self._homing(time, m, self._valve(m, state, turn) if m.phase == "start" else None, inputs.path)
         if m.path is not None:
             m = changed(m, q=m.path.sample(time))
         gripper = np.array([self.robot.opening, self.config.gripper_force])
@@ -182,70 +167,38 @@ class KinematicApproach:
         X_BV = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OV0, turn.angle))
         return X_BV if np.hypot(*X_BV[:2, 3]) < NEAR else None
 
-    def _homing(self, time: float, m: Memory, X_BV: np.ndarray | None) -> Memory:
+    def _homing(self, time: float, m: Memory, X_BV: np.ndarray | None, path: PathPlan) -> Memory:
         """Brings the arms home along a free path, once per activation; m.path is the move, phase "home" on arrival.
 
         X_BV: of a valve to keep clear of; read in phase "start" alone.
         """
         if m.phase == "start":
             m = self._move(time, m, self.home, X_BV)
+        m = self._follow(time, m, path)
         if m.phase == "moving" and (m.path is None or time >= m.path.end()):
             m = changed(m, phase="home", since=time)
         return m
 
+    def _ask(self, m: Memory, kind: str, X_BV: np.ndarray | None, **what: Any) -> Memory:
+        request = PlanRequest(m.request.number + 1, kind, X_BV is not None, np.eye(3, 4) if X_BV is None else X_BV)
+        return changed(m, request=dc.replace(request, **what))
+
     def _move(self, time: float, m: Memory, goal: np.ndarray, X_BV: np.ndarray | None) -> Memory:
-        """Plans a path from the present command to `goal`; phase "moving", or "blocked" if there is none."""
+        """Asks for a path from the present command to `goal`: phase "planning"; "moving" if there is no way to go."""
+        m = changed(m, path=None, since=time)
         if np.max(np.abs(goal - m.q)) < 1e-6:
-            return changed(m, phase="moving", path=None, since=time)
-        arms, split = self.robot.arms, self.robot.split
+            return changed(m, phase="moving")
+        return changed(self._ask(m, "path", X_BV, start=m.q, goal=goal), phase="planning")
 
-        def is_free(q: np.ndarray) -> bool:
-            return all(arms[side].within(part) for side, part in split(q).items()) and self.stances.is_free(X_BV, q)
-
-        points = find_path(m.q, goal, self._vias(m.q, goal, X_BV), is_free)
-        if points is None:
-            return changed(m, phase="blocked", path=None, since=time)
+    def _follow(self, time: float, m: Memory, answer: PathPlan) -> Memory:
+        """Takes the path that was asked for: phase "moving", or "blocked" if there is none."""
+        if m.phase != "planning" or answer.number != m.request.number:
+            return m
+        if not answer.found:
+            return changed(m, phase="blocked", since=time)
+        points = answer.points.reshape(-1, len(self.home))
         path = Path(points, time, self.config.joint_speed, self.config.joint_acceleration)
         return changed(m, phase="moving", path=path, since=time)
-
-    def _vias(self, q: np.ndarray, goal: np.ndarray, X_BV: np.ndarray | None) -> list[np.ndarray]:
-        """Via poses: both hands drawn straight back from the end of the path at the valve; nearly always free."""
-        if X_BV is None:
-            return []
-        at_valve = self.robot.split(q if np.allclose(goal, self.home) else goal)
-        out: list[np.ndarray] = []
-        for back in (0.10, 0.16, 0.22):
-            arms = []
-            for side in SIDES:
-                X_BG = standoff(self.robot.forward(side, at_valve[side]), np.array([0.0, 0, 1]), back)
-                X_BG[1, 3] += OUTWARD[side] * back / 2
-                arms.append(self.robot.inverse(side, X_BG, at_valve[side]))
-            reached = [q for q in arms if q is not None]
-            if len(reached) == len(arms):
-                out.append(np.concatenate(reached))
-        return out
-
-    # ------------------------------------------------------------ stance
-    def watch_stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
-        """Computes the stance, in fine_approach. Slow (up to two ticks), and no command of this tick needs it."""
-        return self._find_stance(time, m, mode, estimate) if mode.mode == Mode.FINE_APPROACH else m
-
-    def _find_stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
-        """The stance from the last few estimates: those from nearby are better, so old ones are dropped."""
-        if not estimate.found or estimate.sequence == m.seen:
-            return m
-        looks = (*m.stance_looks, estimate)[-5:]
-        m = changed(m, seen=estimate.sequence, stance_looks=looks)
-        if m.stance.found and time - m.stance_at < self.config.stance_period:
-            return m
-        m = changed(m, stance_at=time)
-        fused = fuse(looks)
-        if not fused.found:
-            return m
-        base, margin = self.stances.find(fused.X_OV, mode.turn_angle)
-        good = margin >= self.stances.config.margin_min
-        reason = "" if good else f"no stance holds both handles through the turn (margin {margin:.2f})"
-        return changed(m, stance=Stance(time=estimate.time, found=good, base=base, margin=margin, reason=reason))
 
     # ------------------------------------------------------------ measure
     def _look(self, time: float, m: Memory, estimate: RectangleEstimate) -> Memory:
@@ -257,6 +210,8 @@ class KinematicApproach:
     def _measure(self, time: float, m: Memory, inputs: Inputs) -> Memory:
         if m.phase == "start":
             m = self._status(changed(m, phase="look", since=time), time, "running")
+        if m.phase == "planning":
+            return self._plan(time, m, inputs.grasps)
         if m.phase != "look":
             return m
         m = self._look(time, m, inputs.estimate)
@@ -273,39 +228,29 @@ class KinematicApproach:
             detail = f"{posture.names[k]} stands at {stands:.3f}, the arms reach from {posture.home[k]:.3f}"
             return self._status(changed(m, phase="end"), time, "failed", Verdict.FAULT, detail)
         X_BV = compose(inverse(planar(*inputs.state.odometry[:3])), fused.X_OV)
-        arc = self.stances.best_arc(X_BV, inputs.mode.turn_angle)
-        if arc.margin < self.stances.config.margin_min:
-            m = self._find_stance(time, changed(m, stance_looks=m.looks, seen=-1), inputs.mode, inputs.estimate)
-            detail = f"arm margin {arc.margin:.2f} from here"
-            return self._status(
-                changed(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, detail, cause=Cause.STANCE
-            )
-        grasps = {side: compose(X_BV, hand_in_valve(side, arc.swapped, self.stances.marker)) for side in SIDES}
-        plan = GraspPlan(
-            time=time,
-            found=True,
-            X_BV=X_BV,
-            covariance=fused.covariance,
-            swapped=arc.swapped,
-            X_BG_left=grasps[LEFT],
-            X_BG_right=grasps[RIGHT],
-            margin=arc.margin,
-        )
-        m = changed(m, phase="end", plan=plan, X_OV0=fused.X_OV)
-        detail = f"valve {np.linalg.norm(X_BV[:2, 3]):.3f} m ahead, {X_BV[2, 3]:.3f} m high, margin {arc.margin:.2f}"
+        m = changed(m, phase="planning", X_OV0=fused.X_OV, covariance=fused.covariance)
+        return self._ask(m, "grasps", X_BV, turn_angle=inputs.mode.turn_angle)
+
+    def _plan(self, time: float, m: Memory, grasps: GraspPlan) -> Memory:
+        """Takes the grasps that were asked for."""
+        if grasps.number != m.request.number:
+            return m
+        m = changed(m, phase="end")
+        if not grasps.found:
+            detail = f"arm margin {grasps.margin:.2f} from here"
+            return self._status(m, time, "failed", Verdict.REACH_LIMIT, detail, cause=Cause.STANCE)
+        p = grasps.X_BV[:, 3]
+        detail = f"valve {np.hypot(p[0], p[1]):.3f} m ahead, {p[2]:.3f} m high, margin {grasps.margin:.2f}"
+        m = changed(m, plan=dc.replace(grasps, time=time, covariance=m.covariance))
         return self._status(m, time, "succeeded", detail=detail)
 
     # ------------------------------------------------------------ reach
     def _reach(self, time: float, m: Memory, inputs: Inputs) -> Memory:
-        plan = m.plan
         if m.phase == "start":
             m = self._status(m, time, "running")
-            goal = self._standoff_joints(plan)
-            if goal is None:
-                return self._status(
-                    changed(m, phase="end"), time, "failed", Verdict.REACH_LIMIT, "stand-off out of reach"
-                )
-            m = self._move(time, m, goal, plan.X_BV)
+            m = self._move(time, m, m.plan.q_standoff, m.plan.X_BV)
+        if m.phase == "planning":
+            m = self._follow(time, m, inputs.path)
             if m.phase == "blocked":
                 return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path to the handles")
         if m.phase == "moving":
@@ -323,22 +268,12 @@ class KinematicApproach:
         mark = getattr(marks, side)
         return float(np.sqrt(mark.area / self.reference_area[side])) if mark.found else 0.0
 
-    def _standoff_joints(self, plan: GraspPlan) -> np.ndarray | None:
-        arms = []
-        for side in SIDES:
-            X_BG = plan.X_BG_left if side == LEFT else plan.X_BG_right
-            near = self.robot.inverse(side, X_BG)
-            back = standoff(X_BG, self.stances.view[side], self.stances.config.standoff)
-            arms.append(None if near is None else self.robot.inverse(side, back, near))
-        reached = [q for q in arms if q is not None]
-        return np.concatenate(reached) if len(reached) == len(arms) else None
-
     # ------------------------------------------------------------ fold
     def _fold(self, time: float, m: Memory, inputs: Inputs) -> Memory:
         if m.phase == "start":
             m = self._status(m, time, "running")
-        if m.phase in ("start", "moving"):
-            m = self._homing(time, m, turned(m.plan.X_BV, inputs.turn.angle))
+        if m.phase in ("start", "planning", "moving"):
+            m = self._homing(time, m, turned(m.plan.X_BV, inputs.turn.angle), inputs.path)
             if m.phase == "blocked":
                 return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path home")
         if m.phase == "home":

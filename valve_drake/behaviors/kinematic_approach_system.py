@@ -1,15 +1,17 @@
 """Block `kinematic_approach`: stage 3 on ports. No mathematics here."""
 
 from valve_drake.behaviors.kinematic_approach import NOT_OWNED, KinematicApproach, Memory
+from valve_drake.behaviors.kinematic_approach import Inputs as Read
 from valve_drake.messages import (
     Command,
     GraspPlan,
     HandleMarks,
     Mode,
     ModeState,
+    PathPlan,
+    PlanRequest,
     RectangleEstimate,
     RobotState,
-    Stance,
     Status,
     TurnState,
 )
@@ -22,6 +24,8 @@ class KinematicApproachInputs(Inputs):
     estimate: RectangleEstimate
     marks: HandleMarks
     turn: TurnState
+    grasps: GraspPlan
+    path: PathPlan
 
 
 class KinematicApproachSystem(Block[KinematicApproachInputs, Memory]):
@@ -34,14 +38,16 @@ class KinematicApproachSystem(Block[KinematicApproachInputs, Memory]):
     estimate     in   RectangleEstimate  stage 2
     marks        in   HandleMarks        green marks in the wrist images
     turn         in   TurnState          how far the hands say that the valve was turned
+    grasps       in   GraspPlan          answers of stance_planner
+    path         in   PathPlan
     command      out  Command            arms and grippers
     status       out  Status             measure, reach, fold, verify
-    stance       out  Stance             where the base should stand, in O
     plan         out  GraspPlan          the valve and the grasps in B, measured at rest
+    request      out  PlanRequest        to stance_planner
     """
 
     AWAKE = frozenset(Mode) - frozenset(NOT_OWNED)
-    OUTPUTS = {"command": Command, "status": Status, "stance": Stance, "plan": GraspPlan}
+    OUTPUTS = {"command": Command, "status": Status, "plan": GraspPlan, "request": PlanRequest}
 
     def __init__(self, law: KinematicApproach, name: str = "kinematic_approach"):
         self._law = law
@@ -51,16 +57,14 @@ class KinematicApproachSystem(Block[KinematicApproachInputs, Memory]):
         return Memory()
 
     def step(self, time: float, inputs: KinematicApproachInputs, memory: Memory) -> tuple[Memory, Outputs]:
-        memory, command = self._law.step(
-            time, memory, inputs.robot_state, inputs.mode, inputs.estimate, inputs.marks, inputs.turn
+        read = Read(
+            state=inputs.robot_state,
+            mode=inputs.mode,
+            estimate=inputs.estimate,
+            marks=inputs.marks,
+            turn=inputs.turn,
+            grasps=inputs.grasps,
+            path=inputs.path,
         )
-        return memory, {
-            "command": command,
-            "status": memory.status,
-            "stance": memory.stance,
-            "plan": memory.plan,
-        }
-
-    def later(self, time: float, inputs: KinematicApproachInputs, memory: Memory) -> tuple[Memory, Outputs]:
-        after = self._law.watch_stance(time, memory, inputs.mode, inputs.estimate)
-        return after, {} if after.stance is memory.stance else {"stance": after.stance}
+        memory, command = self._law.step(time, memory, read)
+        return memory, {"command": command, "status": memory.status, "plan": memory.plan, "request": memory.request}

@@ -84,6 +84,10 @@ class RobotKinematics(Protocol):
     def posture(self) -> Joints: ...
 
     @property
+    def lift(self) -> int:
+        """How many of the posture's joints are the lift; they come first."""
+
+    @property
     def hands(self) -> Mapping[str, HandLoad]: ...
 
     @property

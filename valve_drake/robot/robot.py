@@ -154,6 +154,11 @@ class Robot:
         return self.torso.names.index(name) if name else None
 
     @property
+    def lift(self) -> int:
+        """How many of the posture's joints are the lift; they come first."""
+        return len(self.description.lift.joints)
+
+    @property
     def groups(self) -> Groups:
         """The joints that are commanded by position."""
         return Groups(self.torso.names, self.arms[LEFT].names, self.arms[RIGHT].names)

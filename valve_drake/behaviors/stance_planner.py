@@ -1,0 +1,174 @@
+"""Where to stand, how to hold the valve, how the arms get there: the searches, beside the control loop.
+
+    fine_approach  the stance for the whole turn, from the last few estimates, again every `period`
+    a PlanRequest  grasps from where the robot stands, or a collision-free path of both arms
+
+A search takes up to some seconds of processor time. It is cut into portions of a few milliseconds (one place to stand
+at, one line of a path), one portion a step, so that no control tick waits for it. Portions are counted and not timed:
+the same inputs give the same answer in the same step.
+"""
+
+import copy
+import dataclasses as dc
+
+import numpy as np
+
+from valve_drake.behaviors.grasp_geometry import Stances, StanceSearch, hand_in_valve, standoff
+from valve_drake.behaviors.joint_path import PathSearch
+from valve_drake.config import Config, number
+from valve_drake.frames import compose
+from valve_drake.memory import changed
+from valve_drake.messages import (
+    LEFT,
+    RIGHT,
+    SIDES,
+    GraspPlan,
+    Mode,
+    ModeState,
+    PathPlan,
+    PlanRequest,
+    RectangleEstimate,
+    Stance,
+)
+from valve_drake.perception.fusion import fuse
+from valve_drake.robot.kinematics import OUTWARD
+from valve_drake.task.modes import TABLE
+
+# Modes in which kinematic_approach may ask: it moves the arms.
+ASKED = tuple(mode for mode, row in TABLE.items() if row.hands == "kinematic_approach")
+LOOKS = 5  # estimates that a stance is made from; those from nearby are better, so old ones are dropped
+BACK = (0.10, 0.16, 0.22)  # of the via poses: hands drawn straight back from the valve [m]
+
+
+@dc.dataclass
+class StancePlannerConfig(Config):
+    """Scenario key `stance_planner`."""
+
+    KEY = "stance_planner"
+    period: float = number(0.5, 0.1, 10.0, "between two computations of the stance [s]")
+
+
+@dc.dataclass(frozen=True)
+class Memory:
+    """Everything between two steps."""
+
+    activation: int = -1
+    looks: tuple[RectangleEstimate, ...] = ()
+    search: StanceSearch | None = None
+    searched: RectangleEstimate = RectangleEstimate()  # the newest estimate that `search` is made from
+    begun: float = -1e9  # when the last search for a stance began [s]
+    stance: Stance = Stance()
+    number: int = -1  # of the last request
+    path_search: PathSearch | None = None
+    vias_left: bool = False  # the via poses are still to be found
+    grasps: GraspPlan = GraspPlan()
+    path: PathPlan = PathPlan()
+
+
+class StancePlanner:
+    """The mathematics of the block. stances: where the hands can turn the valve from; they hold robot and marker."""
+
+    def __init__(self, config: StancePlannerConfig, stances: Stances):
+        config.check()
+        stances.config.check()
+        stances.marker.check()
+        self.config = copy.copy(config)
+        self.stances = dc.replace(
+            stances, config=copy.copy(stances.config), marker=copy.copy(stances.marker), view=dict(stances.view)
+        )
+        self.robot = stances.robot
+
+    def step(
+        self, time: float, memory: Memory, mode: ModeState, estimate: RectangleEstimate, request: PlanRequest
+    ) -> Memory:
+        """One portion -> memory, with stance, grasps and path in it. A request comes before the stance."""
+        m = memory
+        if mode.mode == Mode.SEARCH and m.activation != mode.activation:
+            m = changed(m, stance=Stance(), looks=(), search=None, begun=-1e9)
+        m = changed(m, activation=mode.activation) if m.activation != mode.activation else m
+        if request.number != m.number:
+            return self._take(m, request)
+        if m.path_search is not None:
+            return self._path(m, request)
+        return self._stance(time, m, mode, estimate) if mode.mode == Mode.FINE_APPROACH else m
+
+    # ------------------------------------------------------------ stance
+    def _stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
+        if estimate.found and (not m.looks or estimate.sequence != m.looks[-1].sequence):
+            m = changed(m, looks=(*m.looks, estimate)[-LOOKS:])
+        if m.search is None:
+            due = not m.stance.found or time - m.begun >= self.config.period
+            if not due or not m.looks or m.looks[-1] is m.searched:
+                return m
+            fused = fuse(m.looks)
+            m = changed(m, searched=m.looks[-1], begun=time)
+            if not fused.found:
+                return m
+            m = changed(m, search=self.stances.begin(fused.X_OV, mode.turn_angle))
+        assert m.search is not None
+        search = self.stances.advance(m.search)
+        if not search.done:
+            return changed(m, search=search)
+        margin, best = search.margin, search.best
+        good = best is not None and margin >= self.stances.config.margin_min
+        reason = "" if good else f"no stance holds both handles through the turn (margin {margin:.2f})"
+        stance = Stance(time=m.searched.time, found=good, margin=margin, reason=reason)
+        if best is not None:
+            posture = self.robot.posture.home if best.posture is None else best.posture
+            stance = dc.replace(stance, base=best.base, posture=posture)
+        return changed(m, search=None, stance=stance)
+
+    # ------------------------------------------------------------ requests
+    def _take(self, m: Memory, request: PlanRequest) -> Memory:
+        """A new request: the one before is dropped."""
+        m = changed(m, number=request.number, path_search=None)
+        if request.kind == "grasps":
+            return changed(m, grasps=self._grasps(request))
+        if request.kind == "path":
+            return changed(m, path_search=PathSearch(request.start, request.goal), vias_left=request.valve)
+        return m
+
+    def _grasps(self, request: PlanRequest) -> GraspPlan:
+        arc = self.stances.best_arc(request.X_BV, request.turn_angle)
+        found = arc.margin >= self.stances.config.margin_min
+        plan = GraspPlan(number=request.number, found=found, X_BV=request.X_BV, swapped=arc.swapped, margin=arc.margin)
+        if not found:
+            return plan
+        X_BG = {side: compose(request.X_BV, hand_in_valve(side, arc.swapped, self.stances.marker)) for side in SIDES}
+        q = np.concatenate([arc.q_standoff[side] for side in SIDES])
+        return dc.replace(plan, X_BG_left=X_BG[LEFT], X_BG_right=X_BG[RIGHT], q_standoff=q)
+
+    def _path(self, m: Memory, request: PlanRequest) -> Memory:
+        """One portion of the search for a path; where the straight line is blocked, the via poses are made."""
+        search = m.path_search
+        assert search is not None
+        X_BV = request.X_BV if request.valve else None
+        arms, split = self.robot.arms, self.robot.split
+
+        def is_free(q: np.ndarray) -> bool:
+            return all(arms[side].within(part) for side, part in split(q).items()) and self.stances.is_free(X_BV, q)
+
+        if search.portion == 1 and m.vias_left:
+            vias = tuple(self.vias(request.start, request.goal))
+            return changed(m, path_search=dc.replace(search, vias=vias), vias_left=False)
+        search = search.advance(is_free)
+        if not search.done:
+            return changed(m, path_search=search)
+        points = np.zeros(0) if search.points is None else search.points.ravel()
+        path = PathPlan(number=request.number, found=search.points is not None, points=points)
+        return changed(m, path_search=None, path=path)
+
+    def vias(self, start: np.ndarray, goal: np.ndarray) -> list[np.ndarray]:
+        """Via poses: both hands drawn straight back from the end of the path at the valve; nearly always free."""
+        at_valve = self.robot.split(start if np.allclose(goal, self.robot.home) else goal)
+        out: list[np.ndarray] = []
+        for back in BACK:
+            arms = []
+            for side in SIDES:
+                X_BG = standoff(self.robot.forward(side, at_valve[side]), np.array([0.0, 0, 1]), back)
+                X_BG[1, 3] += OUTWARD[side] * back / 2
+                arms.append(self.robot.inverse(side, X_BG, at_valve[side]))
+            reached = [q for q in arms if q is not None]
+            if len(reached) == len(arms):
+                out.append(np.concatenate(reached))
+        return out
