@@ -5,7 +5,7 @@ import pathlib
 
 import numpy as np
 import pytest
-from drawn_scene import edge_points, facing, pose_error
+from drawn_scene import edge_points, facing, pose_error, with_information
 
 from valve_drake import frames
 from valve_drake.camera.lens import load_head
@@ -61,6 +61,25 @@ def with_marks(edges, X, along=0):
         green = np.vstack([P[:, :2] / P[:, 2:], [[0.2, 0.1]]])  # and a plant
         quads.append(dc.replace(quad, green=green))
     return dc.replace(edges, left=quads[0], right=quads[1])
+
+
+@pytest.mark.parametrize(
+    ("seed", "rotation_vector", "p"),
+    [
+        (1956, [0.20351, -0.09661, -0.07136], [-0.171777, 0.006274, 2.427088]),
+        (3803, [0.25215, 0.00923, -0.27364], [0.098238, -0.200883, 2.373454]),
+    ],
+)
+def test_a_tilt_is_not_lost_where_the_sides_are_first_counted_by_the_wrong_length(seed, rotation_vector, p):
+    """The right eye stands 0.15 mrad off, the image's first corner is the model's last: both starts fit badly at first,
+    and the better start of the two may be the one whose minimum is the worse."""
+    off = frames.make(frames.rotation(np.array([0.45e-4, 1.5e-4, 0.45e-4])), np.zeros(3))
+    head = dc.replace(HEAD, X_LR=frames.compose(HEAD.X_LR, off))
+    X = frames.make(frames.rotation(np.array(rotation_vector)), np.array(p))
+    points = edge_points(X, HEAD, MARKER, 0.09, np.random.default_rng(seed), first=3)
+    found = estimate(with_information(with_marks(points, X)), head, MARKER, CONFIG)
+    assert np.degrees(np.arccos(found.X_LV[:, 2] @ X[:, 2])) < 6
+    assert found.ambiguity > CONFIG.ambiguity_gate
 
 
 @pytest.mark.parametrize("roll", [-1.5, -1.0, -0.3, 0.3, 0.79, 1.2, 1.5])

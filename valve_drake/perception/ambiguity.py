@@ -15,11 +15,13 @@ from valve_drake import frames
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.moments import Moments
 from valve_drake.perception.paper import closed_form
+from valve_drake.perception.quadrilateral import COUNTED_FROM
 from valve_drake.perception.rectangle_config import RectangleEstimatorConfig
 from valve_drake.perception.refinement import Fit, linearize, refine
 from valve_drake.perception.views import View
 
-_PRUNE_CHI2 = 1000.0  # a start whose chi^2 is this much above the best one's is not refined
+_PRUNE_CHI2 = 1000.0  # beside a fit of a smaller chi^2, a start that is so much worse is not refined
+_QUARTER = frames.rot_z(-np.pi / 2)  # the image's corner 0 is the model's corner 1: V turns back against the image
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
@@ -31,9 +33,14 @@ class Track:
     axis_known: bool = False  # its X axis was settled by marks or sizes
 
 
-def candidates(views: list[View], moments: Moments, model: np.ndarray, config: RectangleEstimatorConfig) -> list[Fit]:
-    """The distinct minima, best first: from both poses of IPPE, else the closed form; then the mirrored tilt."""
-    view = views[0]
+def candidates(
+    views: list[View], moments: Moments, marker: Marker, config: RectangleEstimatorConfig
+) -> tuple[list[Fit], int]:
+    """The distinct minima, best first: from both poses of IPPE, else the closed form; then the mirrored tilt.
+
+    And the model's corner that the image's first one is taken for: 0, or 1 where the green marks say so.
+    """
+    view, model, turn = views[0], marker.corners(), 0
     starts = []
     # V's z points away from the camera: with z towards it IPPE's answers are wrong.
     ok, rvecs, tvecs, _ = cv2.solvePnPGeneric(
@@ -41,10 +48,23 @@ def candidates(views: list[View], moments: Moments, model: np.ndarray, config: R
     )
     for rvec, tvec in zip(rvecs, tvecs) if ok else ():
         starts.append(_to_left(view, cv2.Rodrigues(rvec)[0], tvec.ravel()))
+    if any(_along_y(_mark_votes(views, R, p, marker)) for R, p in starts):
+        starts, model, turn = [(R @ _QUARTER, p) for R, p in starts], model[NEXT], 1
     fits, pruned = _distinct(moments, model, starts, config, [])
     if not fits:
         closed = closed_form([v.corners for v in views], [v.X_CL for v in views], model, "exact")
         fits, pruned = _distinct(moments, model, [closed] if closed is not None else [], config, [])
+    return _with_the_other(moments, model, fits, pruned, config), turn
+
+
+def _with_the_other(
+    moments: Moments,
+    model: np.ndarray,
+    fits: list[Fit],
+    pruned: list[tuple[float, np.ndarray]],
+    config: RectangleEstimatorConfig,
+) -> list[Fit]:
+    """The fits, and where it is only one, that of the mirrored tilt, or of what was left out. See `_distinct`."""
     if len(fits) == 1 and not pruned:
         mirrored = _mirrored(fits[0].R, fits[0].p)
         fits, pruned = _distinct(moments, model, [mirrored], config, fits)
@@ -72,15 +92,19 @@ def _distinct(
             continue
         if fits:
             cost = _moved_to_fit(moments, model, R, p)
-            if cost > fits[0].cost + _PRUNE_CHI2:
+            # A worse fit explains the sides as little as the start does, and may be a minimum that leads nowhere.
+            if fits[0].cost < _PRUNE_CHI2 < cost - fits[0].cost:
                 if math.isfinite(cost):
                     pruned.append((cost, R))
                 continue
         fit = refine(moments, model, R, p, 0.0, config, enough=0.05)
-        if fit is not None and fit.R[2, 2] > 0:
-            if not any(np.linalg.norm(frames.rotation_vector(fit.R.T @ other.R)) < 1e-3 for other in fits):
-                fits.append(fit)
+        if fit is not None and fit.R[2, 2] > 0 and _is_new(fit, fits):
+            fits.append(fit)
     return sorted(fits, key=lambda fit: fit.cost), pruned
+
+
+def _is_new(fit: Fit, fits: list[Fit]) -> bool:
+    return not any(np.linalg.norm(frames.rotation_vector(fit.R.T @ other.R)) < 1e-3 for other in fits)
 
 
 def _moved_to_fit(moments: Moments, model: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
@@ -111,38 +135,47 @@ def settle_axis(
     views: list[View],
     moments: Moments,
     fits: list[Fit],
+    turn: int,
     marker: Marker,
     config: RectangleEstimatorConfig,
     track: Track | None,
 ) -> tuple[int, bool, list[Fit]]:
-    """How many corners the image's first one lies ahead of the model's (0..3), whether that is sure, the fits so."""
+    """How many corners the image's first one lies ahead of the model's (0..3), whether that is sure, the fits so.
+
+    turn: what the fits take it for.
+    """
     swapped, known = None, True
-    votes = _mark_votes(views, fits[0], marker)
+    model = marker.corners()[COUNTED_FROM[turn + 1]]
+    votes = _mark_votes(views, fits[0].R, fits[0].p, marker)
     if votes[0] != votes[1]:
-        quarter = int(votes[1] > votes[0])
+        quarter = int(_along_y(votes))
     elif marker.aspect() > 1 + config.square_tolerance:
-        swapped = _quarter_turned(moments, fits, marker, config)
+        swapped = _quarter_turned(moments, model, fits, config)
         quarter = int(bool(swapped) and swapped[0].cost < fits[0].cost)
     else:
         angles = fits[0].R.T @ track.X_LV[:, 0] if track is not None else fits[0].R[0]
         quarter = int(abs(angles[1]) > abs(angles[0]))
         known = track is not None and track.axis_known
     if quarter:
-        fits = swapped or _quarter_turned(moments, fits, marker, config) or fits
+        fits = swapped or _quarter_turned(moments, model, fits, config) or fits
     n = fits[0].R[:, 0]
     ahead = n @ track.X_LV[:, 0] if track is not None else n[0]
     if ahead < 0:
         fits = [_half_turned(fit) for fit in fits]
-    return quarter + 2 * int(ahead < 0), known, fits
+    return (turn + quarter + 2 * int(ahead < 0)) % 4, known, fits
 
 
-def _mark_votes(views: list[View], fit: Fit, marker: Marker) -> tuple[int, int]:
-    """Green marks found where they should be if X is the fit's x axis, or its y axis."""
+def _along_y(votes: tuple[int, int]) -> bool:
+    return votes[1] > votes[0]
+
+
+def _mark_votes(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker) -> tuple[int, int]:
+    """Green marks found where they should be if X is this pose's x axis, or its y axis."""
     r, depth = marker.handle_radius, marker.mark_depth
     places = np.array([[r, 0, depth], [-r, 0, depth], [0, r, depth], [0, -r, depth], [0, 0, 0]])
     votes = np.zeros(4, int)
     for view in views:
-        P = (places @ fit.R.T + fit.p) @ view.X_CL[:, :3].T + view.X_CL[:, 3]
+        P = (places @ R.T + p) @ view.X_CL[:, :3].T + view.X_CL[:, 3]
         if len(view.green) == 0 or not (P[:, 2] > 1e-3).all():
             continue
         xy = P[:, :2] / P[:, 2:]
@@ -151,13 +184,17 @@ def _mark_votes(views: list[View], fit: Fit, marker: Marker) -> tuple[int, int]:
     return int(votes[0] + votes[1]), int(votes[2] + votes[3])
 
 
-def _quarter_turned(moments: Moments, fits: list[Fit], marker: Marker, config: RectangleEstimatorConfig) -> list[Fit]:
-    """The fits with the image's first corner one further along the model."""
-    model = marker.corners()[NEXT]
-    # Corner 0 of the image now is the model's corner 1: V turns back by a quarter against the image.
-    Q = frames.rot_z(-np.pi / 2)
-    turned = [refine(moments, model, fit.R @ Q, fit.p, fit.yaw, config) for fit in fits[:2]]
-    return sorted((fit for fit in turned if fit is not None), key=lambda fit: fit.cost)
+def _quarter_turned(
+    moments: Moments, model: np.ndarray, fits: list[Fit], config: RectangleEstimatorConfig
+) -> list[Fit]:
+    """The fits with the image's first corner one further along, which `model` begins with."""
+    turned: list[Fit] = []
+    for fit in fits[:2]:
+        one = refine(moments, model, fit.R @ _QUARTER, fit.p, fit.yaw, config)
+        if one is not None and _is_new(one, turned):
+            turned.append(one)
+    # By the other side's length the tilts were wrong, and may both have led here to the same one.
+    return _with_the_other(moments, model, sorted(turned, key=lambda fit: fit.cost), [], config)
 
 
 def _half_turned(fit: Fit) -> Fit:

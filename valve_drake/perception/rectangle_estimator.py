@@ -58,12 +58,12 @@ def _estimate(
     if reason:
         return _refuse(edges, config, reason)
     moments = moments_of(views, [view.trust for view in views], config)
-    fits = candidates(views, moments, marker.corners(), config)
+    fits, turn = candidates(views, moments, marker, config)
     if not fits:
         return _refuse(edges, config, "no pose explains the sides")
     if track is not None and len(fits) > 1 and fits[1].cost - fits[0].cost < config.ambiguity_gate:
         fits.sort(key=lambda fit: -fit.R[:, 2] @ track.X_LV[:, 2])
-    turn, axis_known, fits = settle_axis(views, moments, fits, marker, config, track)
+    turn, axis_known, fits = settle_axis(views, moments, fits, turn, marker, config, track)
     model = marker.corners()[COUNTED_FROM[turn]]
     pose_by = _paper if config.method == "paper" else _refined
     pose = pose_by(views, moments, model, fits[0], config)
