@@ -175,10 +175,22 @@ def test_a_move_that_cannot_begin_is_refused_with_the_reason_also_at_its_confirm
     assert converse(state, Heard("confirm"), 1.0, refusal="it is turning")[1].outcome == "refused"
 
 
+def test_a_held_turn_goes_on_by_confirm_alone():
+    assert outcomes((0, "confirm")) == ["ignored"]
+    (given,) = talk((0, "confirm"), held=True, refusal="it is turning")
+    assert (given.outcome, given.intent.kind) == ("given", Kind.RESUME)
+    assert outcomes((0, "half"), (1, "cancel"), (2, "the weather"), held=True) == ["ignored", "answered", "ignored"]
+
+
 def test_status_answers_and_reset_leads_out_of_a_failure_only():
     (answer,) = talk((0, "robot, status"), status="idle")
     assert (answer.outcome, answer.says) == ("answered", "idle")
-    assert outcomes((0, "robot reset"), faulty=True) == ["given"]
+    asked, given = talk((0, "robot reset"), (1, "confirm"), faulty=True, refusal="the last run has failed")
+    assert (asked.says, given.outcome, given.intent.kind) == (
+        "reset, the arms go home: say confirm",
+        "given",
+        Kind.RESET,
+    )
     assert outcomes((0, "robot reset")) == ["answered"]
     assert outcomes((0, "status"), (1, "reset"), faulty=True) == ["ignored", "ignored"]
 

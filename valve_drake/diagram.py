@@ -32,7 +32,8 @@ from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError, require
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, make
-from valve_drake.messages import SIDES, OperatorCommand
+from valve_drake.messages import SIDES, OperatorCommand, OperatorPackets
+from valve_drake.operator.operator_channel_system import OperatorChannelSystem
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
 from valve_drake.perception.handle_marker_system import HandleMarkerSystem
 from valve_drake.perception.line_fitting_system import LineFittingSystem
@@ -110,7 +111,30 @@ WIRES: tuple[tuple[str, str], ...] = (
     ),
 )
 
-OPERATOR = "operator"  # the diagram's input port
+OPERATOR = "operator"  # the diagram's input port: the program's own command
+PACKETS = "packets"  # another one, where operators are listened to: what they have sent
+
+# Where operators are listened to, they stand before the port OPERATOR.
+COMMANDED = ((f"{OPERATOR}", "supervisor.operator"),)
+LISTENING: tuple[tuple[str, str], ...] = (
+    (OPERATOR, "operator_channel.local"),
+    (PACKETS, "operator_channel.packets"),
+    ("supervisor.mode", "operator_channel.mode"),
+    ("hybrid_rotation.status", "operator_channel.turning"),
+    ("rectangle_estimator.estimate", "operator_channel.estimate"),
+    ("handle_marker.marks", "operator_channel.marks"),
+    ("operator_channel.command", "supervisor.operator"),
+)
+
+
+def listens(scenario: Scenario) -> bool:
+    """Whether operators are listened to."""
+    return scenario.operator_channel.wire != "none"
+
+
+def wires_of(scenario: Scenario) -> tuple[tuple[str, str], ...]:
+    """Every arrow between blocks, and from the diagram's input ports (names without a dot)."""
+    return WIRES + (LISTENING if listens(scenario) else COMMANDED)
 
 
 @dc.dataclass(frozen=True)
@@ -120,6 +144,7 @@ class System:
     diagram: Diagram
     station: Diagram
     supervisor: SupervisorSystem
+    operator_channel: OperatorChannelSystem | None  # where operators are listened to
 
 
 def robot_of(scenario: Scenario) -> Robot:
@@ -242,6 +267,11 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
         HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, marker, robot, view)),
         CommandSelectorSystem(scenario.command_selector, initial_commands(scenario), robot.torso, robot.arms),
         SupervisorSystem(scenario.supervisor),
+        *(
+            [OperatorChannelSystem(scenario.operator_channel, scenario.angle, scenario.supervisor.angle_limit)]
+            if listens(scenario)
+            else []
+        ),
     ]
 
 
@@ -268,10 +298,13 @@ def make_diagram(
     for block in blocks.values():
         builder.AddSystem(block)
     systems: dict[str, Any] = blocks | {"station": station}
-    for source, target in WIRES:
-        (a, output), (b, port) = source.split(".", 1), target.split(".", 1)
+    for source, target in wires_of(scenario):
+        b, port = target.split(".", 1)
+        if "." not in source:
+            builder.ExportInput(systems[b].GetInputPort(port), source)
+            continue
+        a, output = source.split(".", 1)
         builder.Connect(systems[a].GetOutputPort(output), systems[b].GetInputPort(port))
-    builder.ExportInput(systems["supervisor"].GetInputPort("operator"), OPERATOR)
     for own, inputs in (added or {}).items():
         builder.AddSystem(own)
         for port, source in inputs.items():
@@ -282,18 +315,19 @@ def make_diagram(
         _connect_recorder(builder, recorder, systems, robot_of(scenario).groups, truth)
     diagram = builder.Build()
     diagram.set_name("valve_drake")
-    return System(diagram, station, systems["supervisor"])
+    return System(diagram, station, systems["supervisor"], systems.get("operator_channel"))
 
 
 def recorded_from(name: str) -> str:
-    """The output port that a port of the recorder shows, as "<block>.<port>", or OPERATOR; not for JOINED."""
-    if name == "operator.command":
-        return OPERATOR
+    """The output port that a port of the recorder shows, as "<block>.<port>", OPERATOR or PACKETS; not for JOINED."""
+    if name in _EXPORTED:
+        return _EXPORTED[name]
     if name.startswith("truth."):
         return f"station.{name}"
     return {spec.name: _OWNER[spec.direction] + name for spec in CONTRACT}.get(name, name)
 
 
+_EXPORTED = {"operator.command": OPERATOR, "operator.packets": PACKETS}
 _OWNER = {"out": "station.", "in": "command_selector."}  # of the contract's ports
 
 
@@ -313,10 +347,13 @@ def _connect_recorder(
             builder.Connect(join.get_output_port(), port)
             return
         source = recorded_from(name)
-        if source == OPERATOR:
-            builder.ConnectInput(OPERATOR, port)
+        if "." not in source:
+            if source == OPERATOR or "operator_channel" in systems:
+                builder.ConnectInput(source, port)
             return
         block, output = source.split(".", 1)
+        if block not in systems:  # not of this scenario
+            return
         if not output.startswith("truth.") or (truth and output in exported):
             builder.Connect(systems[block].GetOutputPort(output), port)
         if isinstance(systems[block], Block) and port.get_system() is recorder:
@@ -330,6 +367,11 @@ def _connect_recorder(
 def command(system: System, context: Context, request: OperatorCommand) -> None:
     """Gives the system an operator's request, from now on."""
     system.diagram.GetInputPort(OPERATOR).FixValue(context, Value(request))
+
+
+def deliver(system: System, context: Context, packets: OperatorPackets) -> None:
+    """Gives the system what operators have sent, from now on."""
+    system.diagram.GetInputPort(PACKETS).FixValue(context, Value(packets))
 
 
 def wiring(diagram: Diagram) -> list[str]:

@@ -326,8 +326,59 @@ class OperatorCommand(Message):
     """An operator's request; a new `sequence` makes it a new one. angle > 0 [rad]."""
 
     sequence: int = -1
-    command: str = ""  # open | close | stop | reset
+    command: str = ""  # open | close | stop | reset; hold | resume: of a turn, the grasp is kept meanwhile
     angle: float = np.pi / 2
+
+
+@dc.dataclass(frozen=True, eq=False)
+class OperatorPacket(Message):
+    """What one operator's desk said at one moment: that it is there, and its last words.
+
+    Times are of the desk's own clock. sequence counts what was said from 1; 0: nothing yet.
+    """
+
+    speaker: int = 0  # a random number of the desk
+    sent: float = 0.0  # [s]
+    sequence: int = 0
+    words: str = ""
+    score: float = 0.0  # how sure the recogniser was, 0 to 1
+    said: float = 0.0  # when the words were complete [s]
+    begin: float = 0.0  # of the sound that they were heard in [s]
+    end: float = 0.0
+    typed: bool = False  # not heard, but entered
+
+
+@dc.dataclass(frozen=True, eq=False)
+class OperatorPackets(Message):
+    """What has arrived from operators since the last time, in order; `count` makes it new."""
+
+    time: float = 0.0  # of arrival [s]
+    count: int = 0
+    packets: tuple[OperatorPacket, ...] = ()
+
+
+@dc.dataclass(frozen=True, eq=False)
+class OperatorState(Message):
+    """What the robot answers its operator, and what the desk shows."""
+
+    time: float = 0.0  # of the last change [s]
+    speaker: int = 0  # who has the robot's ear; 0: nobody
+    linked: bool = False  # it was heard of late
+    other: int = 0  # another one that spoke, and was refused; 0: none
+    heard: int = 0  # sequence of the last words taken from `speaker`
+    words: str = ""  # they
+    score: float = 0.0
+    outcome: str = ""  # ignored | listening | asked | answered | refused | given
+    answers: int = 0  # counts what the robot has said; new: there is something new to read
+    says: str = ""
+    task: int = 0  # sequence of the words that gave the last command to turn
+    done: bool = True  # it has ended
+    verdict: str = ""  # how
+    mode: str = Mode.IDLE.value
+    reason: str = ""
+    turned: float = 0.0  # by the hands, in whole degrees [deg]
+    held: bool = False  # the turn waits for the operator
+    sees: str = ""  # what the cameras make of their last images
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -346,6 +397,7 @@ class ModeState(Message):
     head_every: int = 0  # perception looks at every n-th pair of the head's images; 0: at none
     wrist_every: int = 0  # the same of the wrists' images
     afresh: bool = False  # it forgets what it followed from image to image
+    held: bool = False  # the turn stands still and the grasp is kept, until the operator goes on
 
 
 @dc.dataclass(frozen=True, eq=False)

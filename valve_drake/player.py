@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from valve_drake.diagram import OPERATOR, WIRES, make_blocks, recorded_from
-from valve_drake.messages import ModeState, OperatorCommand
+from valve_drake.diagram import OPERATOR, PACKETS, listens, make_blocks, recorded_from, wires_of
+from valve_drake.messages import ModeState, OperatorCommand, OperatorPackets
 from valve_drake.ports import SLOT, TICK, Block, Held, Source, Step
 from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.recording.signals import JOINED
@@ -46,14 +46,16 @@ class Player:
 
     def __init__(self, scenario: Scenario, recording: Recording, recorder: RecorderSystem):
         self._recorder, self._groups = recorder, recording.groups
+        self._listens = listens(scenario)
         self._slot = 0  # the next one whose updates are due
-        self._values: dict[str, Any] = {"supervisor.operator": OperatorCommand()}  # what ports hold, by block.port
+        # What ports hold, by block.port, and the diagram's own.
+        self._values: dict[str, Any] = {OPERATOR: OperatorCommand(), PACKETS: OperatorPackets()}
         self._station, self._joined = shown(recording), recording.joined
         blocks = [_Played(block) for block in make_blocks(scenario)]
         for played in blocks:
             for port, value in played.block.initial_outputs().items():
                 self._values[played.ports[port]] = value
-        wires = {target: source for source, target in WIRES} | {"supervisor.operator": "supervisor.operator"}
+        wires = {target: source for source, target in wires_of(scenario)}
         for played in blocks:
             name = played.block.get_name()
             for port, declared in played.block.sources.items():
@@ -84,7 +86,11 @@ class Player:
 
     def command(self, request: OperatorCommand) -> None:
         """The operator's request, from now on."""
-        self._values["supervisor.operator"] = request
+        self._values[OPERATOR] = request
+
+    def deliver(self, packets: OperatorPackets) -> None:
+        """What operators have sent, from now on."""
+        self._values[PACKETS] = packets
 
     def begin(self) -> None:
         """Records what is there at 0."""
@@ -112,8 +118,8 @@ class Player:
                 self._recorder.record(self.time, self.time)
 
     def _read(self, source: str) -> Read:
-        """What an output port holds: "station.<port>" or "<block>.<port>"."""
-        block, port = source.split(".", 1)
+        """What an output port holds: "station.<port>" or "<block>.<port>", or a port of the diagram's own."""
+        block, _, port = source.partition(".")
         if block == "station":
             return self._station[port]
         return lambda time: self._values[source]
@@ -126,9 +132,10 @@ class Player:
             parts = [self._read(recorded_from(part)) for part in JOINED[name](self._groups)]
             return lambda time: np.concatenate([part(time) for part in parts])
         source = recorded_from(name)
-        if source == OPERATOR:
-            return self._read("supervisor.operator")
-        return None if source.startswith("station.truth.") else self._read(source)
+        there = source.startswith("station.") or source in self._values
+        if source.startswith("station.truth.") or not there or (source == PACKETS and not self._listens):
+            return None
+        return self._read(source)
 
 
 class _Wired:

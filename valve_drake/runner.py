@@ -8,6 +8,7 @@ import dataclasses as dc
 import functools
 import gc
 import json
+import math
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -26,13 +27,14 @@ from valve_drake.behaviors.taught import load_taught
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError, OperationFailed, require
 from valve_drake.config import key_names
-from valve_drake.diagram import System, command, make_diagram, rig_of, robot_of
-from valve_drake.messages import Mode, ModeState, OperatorCommand, Verdict
+from valve_drake.diagram import System, command, deliver, listens, make_diagram, rig_of, robot_of
+from valve_drake.messages import Mode, ModeState, OperatorCommand, OperatorPackets, Verdict
+from valve_drake.operator.operator_link import OperatorLink
 from valve_drake.pace import PACE, Pace, Pacer
 from valve_drake.player import Player
 from valve_drake.ports import SLOT, TICK
 from valve_drake.processor import goes_first
-from valve_drake.recording import layout
+from valve_drake.recording import foxglove, layout
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recorder_system import RecorderSystem, Sink, Tee
 from valve_drake.recording.robot_frames import RobotFrames, pinholes
@@ -55,6 +57,7 @@ from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.hardware import AHEAD, RobotLink
 from valve_drake.stations.replay import Recording
+from valve_drake.stations.reports import listed
 from valve_drake.task.modes import TERMINAL
 from valve_drake.versions import versions
 
@@ -70,7 +73,15 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 FILES = {key: f"{key}.yaml" for key in READERS}  # the same, as attached to its log
 WORLD = ("simulation", "hardware", "faults")
-RECORDED = ("seed", "station", "command", "angle", "time_limit", *WORLD)  # keys that a replay cannot change
+RECORDED = (
+    "seed",
+    "station",
+    "command",
+    "angle",
+    "time_limit",
+    "operator_channel.wire",
+    *WORLD,
+)  # keys that a replay cannot change
 
 
 @dc.dataclass(frozen=True)
@@ -143,6 +154,7 @@ def run(
     duration: float | None = None,
     live: Sink | None = None,
     link: RobotLink | None = None,
+    operators: OperatorLink | None = None,
     show: Callable[[Progress], None] = lambda progress: None,
     say: Callable[[str], None] = lambda line: None,
     stop: Callable[[], bool] = lambda: False,
@@ -152,8 +164,10 @@ def run(
     log: its name; the next free one is taken if it exists (recording/active.py). overwrite: it may be replaced.
     recording: puts a 3D recording beside the log. meshcat: serves it live. truth: records the truth ports.
     duration: stop then, whatever the mode [s]. live: also gets all that is logged. link: to the robot of
-    station `hardware`, else made of the scenario. show: called every STEP. say: told what the user should know.
+    station `hardware`, operators: to those of `operator_channel`, else made of the scenario.
+    show: called every STEP. say: told what the user should know.
     stop: True makes the operator's stop.
+    Where operators are listened to, the run waits for their words, may hold many turns, and ends by `stop`.
     Raises ConfigError or OperationFailed before the first message is logged, and leaves no file then. Later failures
     are in the result.
     """
@@ -174,6 +188,10 @@ def run(
             workers = stack.enter_context(
                 CameraWorkers(*rig_of(scenario))
             )  # before view and writer, which start threads
+        if listens(scenario) and operators is None:
+            shared = link.bus if link is not None and scenario.station == "hardware" else None
+            operators = OperatorLink(shared or Bus(scenario.hardware), alone=shared is None)
+            operators.claim(stop)
         view = _make_view(say if meshcat else None) if recording or meshcat else None
         writer = LogWriter(log, companions=(".json", ".html") if recording else (".json",), overwrite=overwrite)
         stack.enter_context(_log_kept(writer))
@@ -196,6 +214,8 @@ def run(
                 simulator.AdvanceTo(until)
 
         go = advance if pacer is None else _in_real_time(simulator, advance, pacer, sink)
+        if operators is not None:
+            go = _heard(go, operators, system, simulator, sink, in_real_time=pacer is not None)
         last, told = Progress(ModeState(), 0.0, 0.0), False
 
         def watch(progress: Progress) -> None:
@@ -209,6 +229,8 @@ def run(
         try:
             with goes_first(scenario.hardware.priority if paced else 0):
                 mode = _advance(system, simulator, scenario, duration, go, link, watch, stop, begin)
+            if operators is not None and operators.dropped:
+                say(f"bad messages of operators were dropped: {listed(operators.dropped)}")
         except OperationFailed as error:
             if writer.empty:
                 raise
@@ -324,12 +346,18 @@ def _advance(
 ) -> ModeState:
     """go: advances the simulator to a time."""
     context = simulator.get_mutable_context()
-    command(system, context, OperatorCommand(sequence=0, command=scenario.command, angle=scenario.angle))
+    waits = system.operator_channel is not None  # for its operators
+    if waits:
+        command(system, context, OperatorCommand())
+        deliver(system, context, OperatorPackets())
+    else:
+        command(system, context, OperatorCommand(sequence=0, command=scenario.command, angle=scenario.angle))
     with profiling.advance():
         simulator.Initialize()
     port = system.supervisor.GetOutputPort("mode")
     inner = system.supervisor.GetMyContextFromRoot(context)
-    end = scenario.time_limit if duration is None else min(duration, scenario.time_limit)
+    limit = math.inf if waits else scenario.time_limit
+    end = limit if duration is None else min(duration, limit)
     stopped = False
     while True:
         now = context.get_time()
@@ -337,7 +365,7 @@ def _advance(
         show(Progress(mode, now, time.perf_counter() - begin))
         if link is not None:
             link.tell(mode.mode, mode.activation)
-        if mode.mode in TERMINAL and duration is None:
+        if mode.mode in TERMINAL and duration is None and (stopped or not waits):
             end = min(end, mode.since + (TAIL_DONE if mode.mode == Mode.DONE else TAIL))
         if now >= end:
             if link is not None:
@@ -347,6 +375,40 @@ def _advance(
             stopped = True
             command(system, context, OperatorCommand(sequence=1, command="stop"))
         go(min(now + STEP, end))
+
+
+def _heard(
+    go: Callable[[float], object],
+    operators: OperatorLink,
+    system: System,
+    simulator: Simulator,
+    sink: Sink,
+    in_real_time: bool,
+) -> Callable[[float], None]:
+    """AdvanceTo that hands over what operators have sent, and answers them. in_real_time: `go` keeps to the wall's
+    clock; else it is held to that here (it may be slower), so that the operators' times are those of the run."""
+    channel = system.operator_channel
+    assert channel is not None
+    port, context = channel.GetOutputPort("state"), simulator.get_mutable_context()
+    inner = channel.GetMyContextFromRoot(context)
+    free = in_real_time or operators.bus.lcm.get_lcm_url().startswith("memq")
+    begin = time.monotonic() - context.get_time()
+
+    def advance(until: float) -> None:
+        nonlocal begin
+        now = context.get_time()
+        operators.tell(port.Eval(inner))
+        packets = operators.take(now)
+        if packets is not None:
+            deliver(system, context, packets)
+        for sound in operators.sounds():
+            sink.write(foxglove.AUDIO, foxglove.audio(now, sound.rate, sound.samples), now)
+        go(until)
+        while not free and (left := begin + until - time.monotonic()) > 0:
+            operators.pass_time(left)
+        begin = max(begin, time.monotonic() - until)  # what is lost is not made up for
+
+    return advance
 
 
 def _in_real_time(
@@ -450,7 +512,7 @@ def replay(
     recorded, notes = _recorded_scenario(log)
     changed = [split_override(override)[0] for override in overrides]
     for key in changed:
-        if key.partition(".")[0] in RECORDED:
+        if key in RECORDED or key.partition(".")[0] in RECORDED:
             raise ConfigError(f"--set {key}: it is recorded; a replay can change the blocks' keys only")
     scenario = with_overrides(dc.replace(recorded, station="replay"), overrides)
     cv2.setNumThreads(1)  # as in the run
@@ -522,12 +584,20 @@ def _feed(player: Player, recording: Recording, show: Callable[[Progress], None]
             player.advance(min(player.time + STEP, until))
             show(Progress(player.mode, player.time, time.perf_counter() - begin))
 
-    requests = list(zip(recording.requests.times, recording.requests.values))
-    player.command(requests[0][1])
-    player.begin()
-    for when, request in requests[1:]:
-        advance(min(when - TICK, recording.end))
-        player.command(request)
+    given: list[tuple[float, Callable[[Any], None], Any]] = []
+    given += [(when, player.command, value) for when, value in zip(recording.requests.times, recording.requests.values)]
+    given += [(when, player.deliver, value) for when, value in zip(recording.packets.times, recording.packets.values)]
+    given.sort(key=lambda event: event[0])
+    begun = False
+    for when, give, value in given:
+        if when > 0 and not begun:
+            player.begin()
+            begun = True
+        if when > 0:
+            advance(min(when - TICK, recording.end))
+        give(value)
+    if not begun:
+        player.begin()
     advance(recording.end)
     return player.mode
 

@@ -22,6 +22,7 @@ from valve_drake.behaviors.stance_planner import StancePlannerConfig
 from valve_drake.behaviors.valve_search import ValveSearchConfig
 from valve_drake.checks import ConfigError, require, shown
 from valve_drake.config import Config, Uniform, choice, number, plain
+from valve_drake.operator.operator_channel import OperatorChannelConfig
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig
 from valve_drake.perception.handle_marker import HandleMarkerConfig
 from valve_drake.perception.line_fitting import LineFittingConfig
@@ -71,7 +72,7 @@ class Scenario(Config):
     station: str = choice("simulated", STATIONS, "the robot that the blocks are wired to")
     command: str = choice("open", ("open", "close"), "what to do with the valve")
     angle: float = number(1.5707963267948966, 0.01, 6.29, "to turn [rad]")
-    time_limit: float = number(240.0, 0.1, 3600.0, "of the whole run [s]")
+    time_limit: float = number(240.0, 0.1, 3600.0, "of the whole run; operators end theirs themselves [s]")
     robot: str = plain("robot/robot.yaml", "a path, one below models/, or a package:// URL")
     head_calibration: str = plain("", "in the place of the robot's: a path, or one below models/")
     taught: str = plain("", "in the place of the robot's: a path, or one below models/")
@@ -90,6 +91,7 @@ class Scenario(Config):
     hybrid_rotation: HybridRotationConfig = dc.field(default_factory=HybridRotationConfig)
     supervisor: SupervisorConfig = dc.field(default_factory=SupervisorConfig)
     command_selector: CommandSelectorConfig = dc.field(default_factory=CommandSelectorConfig)
+    operator_channel: OperatorChannelConfig = dc.field(default_factory=OperatorChannelConfig)
     simulation: SimulationConfig = dc.field(default_factory=SimulationConfig)
     hardware: HardwareConfig = dc.field(default_factory=HardwareConfig)
     faults: list[FaultConfig] = dc.field(

@@ -14,13 +14,14 @@ from google.protobuf.message import Message as Proto
 from valve_drake.messages import Message
 from valve_drake.pace import PACE
 from valve_drake.recording import schemas
-from valve_drake.recording.foxglove import NANO, nanoseconds
+from valve_drake.recording.foxglove import AUDIO, NANO, nanoseconds
 from valve_drake.recording.reader import LogReader, Record
 
 UNCOMPARED = (
     "/truth/",
     PACE,
-)  # prefixes of topics that no block writes: they come from the simulator and the wall clock
+    AUDIO,
+)  # prefixes of topics that no block writes: they come from the simulator, the wall clock and a microphone
 LONGEST = 60  # values in a report are cut to this [characters]
 
 

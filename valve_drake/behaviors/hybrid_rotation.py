@@ -395,6 +395,9 @@ class HybridRotation:
             return m, twists(chain, None, c, np.zeros(6)), gripper
         lead = sense * (m.commanded - m.turned)
         rate = turn_rate(left, m.rate, sense * chain.torque, lead, c, dt)
+        if mode.held:  # it slows down to rest; a stall is none
+            rate = min(rate, max(m.rate - c.rate / c.ramp * dt, 0.0))
+            m = changed(m, progress_at=(time, m.turned))
         m = changed(m, rate=rate, commanded=m.commanded + sense * rate * dt)
         progress = min(max(m.turned / mode.turn_angle, 0.0), 1.0)
         m = changed(m, status=Status(time, m.activation, "running", progress=progress, value=m.turned))

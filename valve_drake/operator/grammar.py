@@ -4,9 +4,9 @@
     confirm                          -> the command is given
     stop                             -> at once, in every state, without the wake phrase
 
-What moves the robot is read back first and waits for `confirm`; every other number of degrees than the one that was
-meant is seen there. `converse` is one pure function, which a log's words can be put through again. A recogniser of
-speech gives `Heard`; it need not know more of this page than `PHRASES`.
+What moves the robot is read back first and waits for `confirm`; a wrong number of degrees is noticed there.
+`converse` is one pure function, which a log's words can be put through again. A recogniser of speech gives `Heard`; it
+need not know more of this page than `PHRASES`.
 
     wake phrase     robot; first in a sentence, or alone and the sentence within `LISTENING`; typed words need none
     move            (open | close) [the] [valve] [half [way] | [by] N [degrees]]; N: 1 to 720, in digits or in words
@@ -41,6 +41,7 @@ class Kind(enum.StrEnum):
     STATUS = "status"
     RESET = "reset"
     STOP = "stop"
+    RESUME = "go on"  # no sentence: `confirm` while the turn is held
 
 
 MOVES = (Kind.OPEN, Kind.CLOSE)
@@ -92,6 +93,8 @@ class Intent:
 
     def words(self) -> str:
         """For people: "open by 90 degrees"."""
+        if self.kind == Kind.RESET:
+            return "reset, the arms go home"
         return f"{self.kind.value} by {_degrees(self.angle)}" if self.kind in MOVES else self.kind.value
 
 
@@ -205,7 +208,7 @@ def _angle(found: "re.Match[str]", full: float) -> float | None:
 class Talk:
     """Where a conversation stands. The next one is made by `converse`."""
 
-    waiting: Intent | None = None  # a move that was read back and waits for `confirm`
+    waiting: Intent | None = None  # what was read back and waits for `confirm`
     since: float = -math.inf  # when that was [s]
     called: float = -math.inf  # when the wake phrase was heard alone [s]
 
@@ -236,11 +239,12 @@ def converse(
     status: str = "",
     refusal: str = "",
     faulty: bool = False,
+    held: bool = False,
 ) -> tuple[Talk, Decision]:
     """One utterance at `time` [s] -> the conversation after it, and what came of it.
 
     full: what `open` alone asks for [rad]. status: the answer to `status`. refusal: why no move can begin now; "": one
-    can. faulty: the last run has failed, which only `reset` leads out of.
+    can. faulty: the last run has failed, which only `reset` leads out of. held: a turn waits, and goes on by `confirm`.
     """
     intent = parse(heard.text, full)
     if not heard.score >= SURE:
@@ -249,21 +253,24 @@ def converse(
         return Talk(), Decision("given", intent, "stop")
     pending = talk.waiting if time - talk.since <= WAITING else None
     talk = dc.replace(talk, waiting=pending)
-    if not (heard.typed or intent.awake or time - talk.called <= LISTENING or pending is not None):
-        return talk, Decision("ignored", intent)
+    if held and pending is None:
+        pending = Intent(Kind.RESUME)
     called = heard.typed or intent.awake or time - talk.called <= LISTENING
+    if not called and pending is None:
+        return talk, Decision("ignored", intent)
     match intent.kind:
         case Kind.WAKE:
             return dc.replace(talk, called=time), Decision("listening", intent, "yes?")
         case Kind.CONFIRM:
             if pending is None:
                 return Talk(), Decision("refused", intent, "there is nothing to confirm")
-            if refusal:
+            if refusal and pending.kind in MOVES:
                 return Talk(), Decision("refused", pending, f"not now: {refusal}")
             return Talk(), Decision("given", pending, pending.words())
         case Kind.CANCEL:
-            return Talk(), Decision("answered", intent, "cancelled" if pending else "there is nothing to cancel")
-        case Kind.AMOUNT if pending is not None:
+            there = talk.waiting is not None
+            return Talk(), Decision("answered", intent, "cancelled" if there else "there is nothing to cancel")
+        case Kind.AMOUNT if pending is not None and pending.kind in MOVES:
             return _ask(dc.replace(pending, angle=intent.angle), time)
         case Kind.OPEN | Kind.CLOSE if called:
             if refusal:
@@ -272,9 +279,7 @@ def converse(
         case Kind.STATUS if called:
             return dc.replace(talk, called=-math.inf), Decision("answered", intent, status)
         case Kind.RESET if called:
-            return Talk(), Decision(
-                "given" if faulty else "answered", intent, "reset" if faulty else "nothing to reset"
-            )
+            return _ask(intent, time) if faulty else (Talk(), Decision("answered", intent, "there is nothing to reset"))
     if called:  # it was meant for the robot
         return dc.replace(talk, called=-math.inf), Decision("refused", intent, "not understood")
     return talk, Decision("ignored", intent)

@@ -21,6 +21,7 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.RawAudio_pb2 import RawAudio
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
@@ -29,6 +30,7 @@ from valve_drake.messages import (
     HandleMark,
     Health,
     ModeState,
+    OperatorState,
     QuadEdges,
     RectangleEstimate,
     Segmentation,
@@ -38,6 +40,7 @@ from valve_drake.recording.refilled import STAMP, Refilled, slot
 from valve_drake.recording.schemas import Encoded
 
 NANO = 1_000_000_000
+AUDIO = "/operator/audio"  # its topic
 ACCEPTED = Color(r=0.0, g=0.9, b=1.0, a=1.0)
 REJECTED = Color(r=1.0, g=0.6, b=0.0, a=1.0)
 FITTED = Color(r=1.0, g=1.0, b=0.0, a=1.0)
@@ -247,3 +250,17 @@ def health_log(health: Health) -> Log | None:
     """The station's faults as a line; nothing while there are none."""
     faults = (("emergency stop",) if health.estop else ()) + health.faults
     return log(health.time, "station", ", ".join(faults), Log.ERROR) if faults else None
+
+
+def operator_log(state: OperatorState) -> Log | None:
+    """What an operator said and the robot answered, as a line."""
+    if not state.answers:
+        return None
+    heard = f"{state.words!r} ({state.score:.2f}, {state.outcome}): " if state.words else ""
+    return log(state.time, "operator", f"{heard}{state.says}")
+
+
+def audio(time: float, rate: int, samples: np.ndarray) -> RawAudio:
+    """Sound (n,) of 16 bits and one channel; `time`: of its first sample [s], `rate` [Hz]."""
+    data = np.ascontiguousarray(samples, "<i2").tobytes()
+    return RawAudio(timestamp=stamp(time), data=data, format="pcm-s16", sample_rate=rate, number_of_channels=1)

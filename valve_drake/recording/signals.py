@@ -7,7 +7,8 @@
 /joint_states  /joint_commands   foxglove.JointStates of the station's measured and commanded vectors
 /<side>_wrist/wrench      schemas.Wrench, as the sensor gives it
 /events  /log             foxglove.Event, foxglove.Log
-/health  /operator/command   the station's and the operator's messages
+/health  /operator/command   the station's and the program's own messages
+/operator/packets            what operators' desks have sent; /operator/audio: foxglove.RawAudio, as it came
 /truth/...                schemas.Vector: simulation only; left out when the ports are not connected
 """
 
@@ -33,6 +34,8 @@ from valve_drake.messages import (
     OperatorCommand,
     PathPlan,
     PlanRequest,
+    OperatorPackets,
+    OperatorState,
     RectangleEstimate,
     RobotState,
     SegmentationPair,
@@ -70,6 +73,9 @@ OUTPUTS: tuple[tuple[str, str, type[Message]], ...] = (  # block, port, kind: re
     ("command_selector", "report", SelectorReport),
     ("supervisor", "mode", ModeState),
     ("operator", "command", OperatorCommand),
+    ("operator", "packets", OperatorPackets),  # these: where operators are listened to
+    ("operator_channel", "command", OperatorCommand),
+    ("operator_channel", "state", OperatorState),
 )
 
 FRAMES: dict[str, tuple[str, type[Message], Callable[[Any], CameraFrame]]] = {  # camera -> who looks at its images
@@ -162,7 +168,7 @@ def signals(
     if scene is not None:
         looks = serialized(scene)  # once, at the start: it takes several ms
         rows += [Signal("/scene", {}, lambda time: looks, period=ONCE)]
-    rows += [*mode_events(), health_line(), *(status_line(block) for block in BEHAVIORS)]
+    rows += [*mode_events(), operator_line(), health_line(), *(status_line(block) for block in BEHAVIORS)]
     rows += [vector(topic_of(port), port, names, SLOW) for port, names in TRUTH.items()]
     return rows
 
@@ -292,6 +298,11 @@ def status_line(block: str) -> Signal:
 def health_line() -> Signal:
     """The station's faults."""
     return log_line("health", Health, foxglove.health_log, lambda health: (health.faults, health.estop))
+
+
+def operator_line() -> Signal:
+    """What an operator said and the robot answered."""
+    return log_line("operator_channel.state", OperatorState, foxglove.operator_log, lambda state: state.answers)
 
 
 def mode_events(port: str = "supervisor.mode") -> list[Signal]:

@@ -17,6 +17,7 @@ from valve_drake.checks import OperationFailed
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
     PRESENCE,
+    ROBOT,
     UNCOUNTED,
     Channel,
     HardwareConfig,
@@ -66,10 +67,10 @@ class Bus:
         for role, key in PRESENCE.items():
             self._subscribe(CHANNELS[key], functools.partial(self._present, role))
 
-    def listen(self, sender: str, heard: Callable[[str, Any], None]) -> None:
-        """Hears all that `sender` says."""
+    def listen(self, sender: str, heard: Callable[[str, Any], None], between: str = ROBOT) -> None:
+        """Hears all that `sender` says between the program and a robot, or an operator."""
         for row in CHANNELS.values():
-            if row.sender == sender and row.key not in PRESENCE.values():
+            if (row.sender, row.between) == (sender, between) and row.key not in PRESENCE.values():
                 self._subscribe(row, heard)
 
     def _subscribe(self, row: Channel, heard: Callable[[str, Any], None]) -> None:
@@ -123,6 +124,11 @@ class Bus:
         return self._names[key]
 
     # ------------------------------------------------------------ who is there
+    @property
+    def instance(self) -> int:
+        """This process's own number."""
+        return int(self._instance)
+
     def _present(self, role: str, key: str, message: Any) -> None:
         try:
             number = 0.0 if isinstance(message, BadMessage) else read_presence(message)
@@ -162,4 +168,4 @@ class Bus:
         return alone
 
 
-WHO = {"robot": "robot or twin", "controller": "program"}
+WHO = {"robot": "robot or twin", "controller": "program", "operator": "operator's desk"}

@@ -34,11 +34,14 @@ from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.network import LOOPBACK, NAME, group_of
 
 PROTOCOL = 1  # version of this table; a robot that speaks another one is refused
-ROBOT, CONTROLLER = "robot", "controller"  # who sends
+ROBOT, CONTROLLER, OPERATOR = "robot", "controller", "operator"  # who sends
 MODE, REQUEST, STATE = "controller.mode", "cameras.request", "robot.state"
 SYNC = {ROBOT: "robot.sync", CONTROLLER: "controller.sync"}
-PRESENCE = {ROBOT: "robot.presence", CONTROLLER: "controller.presence"}
-UNCOUNTED = frozenset((*SYNC.values(), *PRESENCE.values()))  # that lock-step's count of messages leaves out
+PRESENCE = {ROBOT: "robot.presence", CONTROLLER: "controller.presence", OPERATOR: "operator.presence"}
+WORDS, AUDIO, REPORT = "operator.words", "operator.audio", "operator.report"  # between operator and program
+UNCOUNTED = frozenset(  # that lock-step's count of messages leaves out
+    (*SYNC.values(), *PRESENCE.values(), WORDS, AUDIO, REPORT)
+)
 LOCKSTEP_TIME = 60.0  # lock-step: how long either side may think about one tick [s, wall]
 MM = 1e3  # Drake's gripper messages are in mm
 CHANNEL_NAME = re.compile(r"[!-~]{1,63}")  # LCM drops longer ones
@@ -54,7 +57,8 @@ class WrongMessage(ValueError):
 
 @dc.dataclass(frozen=True)
 class Channel:
-    """One row of the table. `key`: its name in the scenario, <device>.<what>."""
+    """One row of the table. `key`: its name in the scenario, <device>.<what>. `between`: the program and a robot, or
+    the program and an operator."""
 
     key: str
     sender: str
@@ -64,6 +68,7 @@ class Channel:
     write: Callable[[Values], Any] | None = None  # values -> message without its stamp; None: made by its sender
     read: Callable[[Any], Values] | None = None
     stamp: str = "utime"
+    between: str = ROBOT
 
     @property
     def device(self) -> str:
@@ -270,6 +275,28 @@ def _rows() -> Iterable[Channel]:
             "tick: -1 before the start; messages: how many of this table were sent since the start, but for sync and "
             "presence", stamp="timestamp",
         )  # fmt: skip
+    yield Channel(
+        WORDS, OPERATOR, lcmt_drake_signal, "every 1/8 s, and at once when something is said",
+        "to: `instance` of operator.report; instance: a random number of this operator's desk; sequence: counts what "
+        "was said, 0: nothing yet; score: 0 to 1, how sure the recogniser was; said, begin, end: when the words were "
+        "complete, and of their sound, on the clock of the stamp [s]; typed: 1 if they were not heard; and 1 under "
+        "`words: ` with the words", stamp="timestamp", between=OPERATOR,
+    )  # fmt: skip
+    yield Channel(
+        AUDIO, OPERATOR, lcmt_image, "while somebody listens by microphone or radio",
+        "sound: one row of samples, PIXEL_FORMAT_GRAY of CHANNEL_TYPE_INT16, not compressed; header.seq counts them "
+        "from 0, header.utime is the first sample's, header.frame_name the rate [Hz]", stamp="", between=OPERATOR,
+    )  # fmt: skip
+    yield Channel(
+        REPORT, CONTROLLER, lcmt_drake_signal, "every 1/8 s, and at once when it changes",
+        "instance: a random number of this program; OperatorState of valve_drake/messages.py by name, its texts as 1 "
+        "under `<name>: ` with the text", stamp="timestamp", between=OPERATOR,
+    )  # fmt: skip
+    yield Channel(
+        PRESENCE[OPERATOR], OPERATOR, lcmt_drake_signal, "every 1/8 s",
+        "instance: that of operator.words, so that two of them on one bus are noticed", stamp="timestamp",
+        between=OPERATOR,
+    )  # fmt: skip
 
 
 CHANNELS: dict[str, Channel] = {row.key: row for row in _rows()}

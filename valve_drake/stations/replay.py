@@ -8,7 +8,8 @@ tick and sees what was there before the tick's updates; a stage reads in the slo
 | all vectors        | every tick, which is when robot_state reads them | from that tick on                |
 | health             | the tick after it appeared                       | from right after the tick before |
 | images             | the tick after a stage has looked at one         | from right after the tick before |
-| operator's command | the tick after it was given                      | given right after the tick before |
+| operators' packets, | the tick after it was given                     | given right after the tick before |
+| the own command    |                                                  |                                   |
 
 An image is the recorded JPEG, decoded as the live camera does, with the capture time and the sequence that its consumer
 passed on. Images that no stage looked at are not in a log: who looks at another time sees the last recorded one.
@@ -35,7 +36,7 @@ from valve_drake.robot.groups import Groups
 from valve_drake.stations.camera_rig import decode_image
 from valve_drake.stations.contract import CAMERAS, CONTRACT, PortSpec, station_of, vectors
 
-JOINTS, HEALTH, OPERATOR = "/joint_states", "/health", "/operator/command"
+JOINTS, HEALTH, OPERATOR, PACKETS = "/joint_states", "/health", "/operator/command", "/operator/packets"
 CONSUMERS = {topic_of(port) for port, _, _ in FRAMES.values()}
 _JOINT = "joints."
 _WRENCH = [f"{part}.{k}" for part in ("torque", "force") for k in range(3)]
@@ -72,7 +73,7 @@ class Recording:
     end: the last tick up to which everything is there [s]; a damaged log is replayed up to its damage.
     tracks: Track by port of the contract: arrays, Health, or (time, CameraFrame without its image).
     joined: the same of the ports of the recorder that join several (signals.JOINED).
-    requests: the operator's commands.
+    requests: the program's own commands. packets: what operators have sent.
     groups: the joints of the robot that was recorded.
     Raises ConfigError if the log lacks something that the stages read.
     """
@@ -81,14 +82,14 @@ class Recording:
         self._log, self.groups = log, groups
         self.tracks: dict[str, Track] = collections.defaultdict(Track)
         self.joined: dict[str, Track] = {}
-        self.requests = Track()
+        self.requests, self.packets = Track(), Track()
         topics = _vectors(groups)
         needed = {HEALTH, OPERATOR, *topics, *CONSUMERS}
         if missing := sorted(needed - {name for name, topic in log.topics.items() if topic.count > 0}):
             raise ConfigError(f"{log.path} cannot be replayed: it has no messages of {', '.join(missing)}")
         images = set()  # topic, time
         vectors: dict[str, list[Record]] = {topic: [] for topic in topics}
-        for record in log.records(needed | (IMAGES.keys() & log.topics)):
+        for record in log.records(needed | ({PACKETS, *IMAGES} & log.topics.keys())):
             topic, time = record.topic, record.time
             if topic in IMAGES:
                 images.add((topic, time))
@@ -97,7 +98,8 @@ class Recording:
             elif topic in CONSUMERS:
                 self._add_frames(topic, time, log.decode(record))
             else:
-                (self.requests if topic == OPERATOR else self.tracks["health"]).add(time, log.decode(record))
+                track = {OPERATOR: self.requests, PACKETS: self.packets, HEALTH: self.tracks["health"]}[topic]
+                track.add(time, log.decode(record))
         for topic, ports in topics.items():
             self._add_vectors(vectors[topic], ports)
         self.end = self._sound_end()

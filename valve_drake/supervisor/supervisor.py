@@ -10,6 +10,9 @@ One block owns each mode: its Status, carrying this activation's number, ends it
     fault or operator's stop                    -> hands at the handles: release, then failed or stopped;
                                                    elsewhere at once, the robot held still
 
+In grasp and turn the operator may `hold`: the turn stands still, the grasp is kept and no deadline runs, until `resume`
+or, after hold_time, a stop.
+
 Retries are counted over the run and bounded; every mode has a deadline, and so has the run (a robot whose odometry is
 wrong could search and drive for minutes within those of its modes). `verify` decides `turned` by camera, even if the
 turn itself had ended with another verdict; otherwise the first verdict stays. A release that fails ends the run at
@@ -35,6 +38,8 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.task.modes import DEADLINES, HEAD_EVERY, MODES, RETRIES, TABLE, TERMINAL, WATCHED, WRIST_EVERY
+
+HOLDS = tuple(mode for mode, row in TABLE.items() if row.owner == "hybrid_rotation" and not row.ending)
 
 # What a behaviour may give as the reason of its failure; anything else is a fault of the program.
 FAILURES = tuple(v for v in Verdict if v not in (Verdict.NONE, Verdict.TURNED, Verdict.STOPPED))
@@ -66,6 +71,7 @@ class SupervisorConfig(Config):
     )
     other_age: float = number(0.25, 0.05, 0.25, "the same for all devices not named in max_age [s]")
     report_age: float = number(0.25, 0.05, 0.25, "the same for the health and selector reports themselves [s]")
+    hold_time: float = number(120.0, 1.0, 3600.0, "a turn that is held for longer is stopped [s]")
     angle_limit: float = number(12.6, 0.01, 12.6, "largest turn that an operator may ask for [rad]")
 
     def oldest(self, device: str) -> float:
@@ -88,6 +94,12 @@ class State:
     after_release: Mode = Mode.FOLD  # where release leads
     entered: tuple[Mode, ...] = ()  # modes of this run, in order
     retried: tuple[str, ...] = ()  # what failed and was tried again in this run
+    held_at: float = math.inf  # since when the operator holds the turn; infinite: he does not [s]
+    held_for: float = 0.0  # for how long he did so in this mode, before [s]
+
+    @property
+    def held(self) -> bool:
+        return self.held_at < math.inf
 
     def message(self, time: float, config: "SupervisorConfig") -> ModeState:
         return ModeState(
@@ -102,6 +114,7 @@ class State:
             head_every=config.head_every.get(self.mode.value, 0),
             wrist_every=config.wrist_every.get(self.mode.value, 0),
             afresh=TABLE[self.mode].afresh,
+            held=self.held,
         )
 
 
@@ -129,6 +142,11 @@ def step(
         return _begin(config, s, time, request, operator.angle, fault) if operator is not None and request else s
     if fault and not _aborting(s):
         return _abort(s, time, Mode.FAILED, Verdict.FAULT, fault)
+    if s.mode in HOLDS:
+        s = _held(s, time, request)
+        if time - s.held_at > config.hold_time:
+            words = f"held for more than {config.hold_time:.0f} s"
+            return _abort(s, time, Mode.STOPPED, Verdict.STOPPED, words)
 
     owner = TABLE[s.mode].owner
     status = statuses.get(owner)
@@ -140,7 +158,9 @@ def step(
     watch = statuses.get("valve_search")
     if s.mode in WATCHED and watch is not None and watch.activation == s.activation and watch.state == "failed":
         return _fail(config, s, time, "valve_search", watch)
-    if time - s.since > deadline(config, s):
+    if s.held:
+        return s
+    if time - s.since - s.held_for > deadline(config, s):
         return _give_up(s, time, Verdict.TIMEOUT, f"{s.mode.value} took more than {deadline(config, s):.0f} s")
     limit = config.run_deadline + config.turn_allowance * abs(s.turn_angle)
     if not TABLE[s.mode].ending and time - s.began > limit:
@@ -180,9 +200,28 @@ def find_fault(config: SupervisorConfig, time: float, health: Health | None, sel
 
 def _enter(s: State, time: float, mode: Mode, reason: str, **changes: Any) -> State:
     """A new activation."""
+    if s.held:
+        began = s.began + time - s.held_at  # the run's own deadline did not run either
+        changes = {"began": began, "held_at": time if mode in HOLDS else math.inf} | changes
     return changed(
-        s, mode=mode, activation=s.activation + 1, since=time, reason=reason, entered=(*s.entered, mode), **changes
+        s,
+        mode=mode,
+        activation=s.activation + 1,
+        since=time,
+        reason=reason,
+        entered=(*s.entered, mode),
+        held_for=0.0,
+        **changes,
     )
+
+
+def _held(s: State, time: float, request: str) -> State:
+    if request == "hold" and not s.held:
+        return changed(s, held_at=time)
+    if request == "resume" and s.held:
+        length = time - s.held_at
+        return changed(s, held_at=math.inf, held_for=s.held_for + length, began=s.began + length)
+    return s
 
 
 def _reset(s: State, time: float) -> State:
