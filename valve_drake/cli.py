@@ -17,6 +17,7 @@ from valve_drake.commands import (
     estimate,
     experiment,
     import_robot,
+    operator,
     recover,
     replay,
     review,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 COMMANDS = (
     run,
     campaign,
+    operator,
     twin,
     scenario,
     draw,

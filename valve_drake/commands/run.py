@@ -40,6 +40,7 @@ def add(commands: Subcommands) -> None:
     p.add_argument("--log", type=Path, metavar="FILE.mcap", help="the log (default: logs/run-<seed>.mcap, or the next)")
     p.add_argument("--overwrite", action="store_true", help="--log may exist, and what lies beside it: it is replaced")
     p.add_argument("--meshcat", action="store_true", help="live 3D view, on this machine only")
+    p.add_argument("--operator", action="store_true", help="waits for an operator's words: `valve-drake operator`")
     p.add_argument("--lockstep", action="store_true", help="station `hardware`: in lock-step with a twin that is, too")
     p.add_argument("--live", action="store_true", help="serve the log's topics to Foxglove, on this machine only")
     p.add_argument(
@@ -61,6 +62,8 @@ def command(options: argparse.Namespace) -> int:
     overrides = scenario_overrides(options)
     if options.request:
         overrides.append(f"command={options.request}")
+    if options.operator:
+        overrides.append("operator_channel.wire=lcm")
     require_in(options.live_port, 0, 65535, "--live-port")
     scenario = scenarios.load(options.scenario, overrides)
     recording = not options.no_html and scenario.station != "hardware"
@@ -103,7 +106,8 @@ def command(options: argparse.Namespace) -> int:
     for line in troubles:
         complain(line)
     cut_short = options.duration is not None and not result.summary.outcome
-    good = (cut_short or result.summary.outcome == "done") and not (troubles or result.log_error)
+    ends = ("done", "stopped") if scenario.operator_channel.wire != "none" else ("done",)  # an operator's end is a stop
+    good = (cut_short or result.summary.outcome in ends) and not (troubles or result.log_error)
     return OK if good else FAILED
 
 

@@ -9,10 +9,12 @@ import time as wall
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from valve_drake.messages import OperatorPacket, OperatorState
 from valve_drake.operator.grammar import SURE, Heard, Kind, parse
 from valve_drake.operator.operator_channel import tag
-from valve_drake.operator.wire import Sound, read_report, sound_message, words_message
+from valve_drake.operator.wire import Sound, read_report, read_sound, sound_message, words_message
 from valve_drake.stations.bus import ANNOUNCED, BadMessage, Bus
 from valve_drake.stations.lcm_channels import AUDIO, CONTROLLER, OPERATOR, WORDS, WrongMessage
 from valve_drake.stations.reports import PRESENT
@@ -38,7 +40,6 @@ class DeskLink:
         self._sent_at = float("-inf")
         self._refused = False
         self._told_others = False
-        self._sounds = 0
         bus.listen(CONTROLLER, self._hear, between=OPERATOR)
 
     @property
@@ -74,9 +75,23 @@ class DeskLink:
             self._queue.append((self.clock(), heard))
         self.poll()
 
+    def listen(self, take: Callable[[np.ndarray], None]) -> None:
+        """Hands the sound that others put on the bus to `take` (n,) int16, as `poll` finds it."""
+
+        def hear(key: str, message: Any) -> None:
+            if key != AUDIO:
+                return
+            try:
+                if isinstance(message, BadMessage):
+                    raise WrongMessage(message.words)
+                take(read_sound(message).samples)
+            except WrongMessage:
+                self.dropped += 1
+
+        self.bus.listen(OPERATOR, hear, between=OPERATOR)
+
     def sound(self, sound: Sound) -> None:
         """Sound for the robot's log."""
-        self._sounds += 1
         self.bus.send(AUDIO, sound_message(sound))
 
     def poll(self) -> None:
