@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from valve_drake import cli, resources
-from valve_drake.behaviors.taught import TaughtReference, load_taught, save_taught
+from valve_drake.behaviors.taught import TaughtReference, load_made_for, load_taught, save_taught
 from valve_drake.checks import ConfigError
 from valve_drake.messages import LEFT, RIGHT, SIDES
 
@@ -81,12 +81,16 @@ def change(path, edit) -> None:
         (lambda d: d["left"].update(jacobian=[[1, 2, 3]] * 3), r"left\b.*[jJ]acobian must be well conditioned"),
         (lambda d: d["right"].update(jacobian=[[0, 0, 0]] * 3), r"right\b.*[jJ]acobian must be well conditioned"),
         (lambda d: d["left"].update(area=0.0), r"left\.area"),
+        (lambda d: d.update(made_for="me"), r"made_for must be a mapping of robot, marker"),
+        (lambda d: d.update(made_for={"robot": "a", "marker": "b"}), r"made_for must be a mapping of robot, marker"),
+        (lambda d: d.update(made_for={"robot": "a", "marker": 3, "opening": 0.08}), r"made_for must be a mapping"),
     ],
 )
 def test_a_bad_file_is_refused_by_name_and_key(file, edit, words):
     change(file, edit)
     with pytest.raises(ConfigError, match=words) as error:
         load_taught(file)
+        load_made_for(file)
     assert str(file) in str(error.value)
 
 

@@ -31,7 +31,7 @@ from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError, require
 from valve_drake.collision import CollisionModel
-from valve_drake.frames import compose, make
+from valve_drake.frames import compose, inverse, make, planar, rot_z
 from valve_drake.messages import SIDES, OperatorCommand, OperatorPackets
 from valve_drake.operator.operator_channel_system import OperatorChannelSystem
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
@@ -51,7 +51,8 @@ from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CONTRACT, vectors
 from valve_drake.stations.hardware import RobotLink, make_hardware_station
 from valve_drake.stations.replay import Recording, make_replay_station
-from valve_drake.stations.simulated import make_simulated_station, rig_arguments
+from valve_drake.stations.scene import panel_pose
+from valve_drake.stations.simulated import RobotStart, make_simulated_station, rig_arguments
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
 from valve_drake.supervisor.supervisor_system import SupervisorSystem
 from valve_drake.task.modes import BEHAVIORS
@@ -183,12 +184,29 @@ def _check_gaze(search: ValveSearchConfig, robot: Robot) -> None:
         require(low <= value <= high, f"valve_search.{name}", words, value)
 
 
+def start_of(scenario: Scenario) -> RobotStart | None:
+    """How the simulated robot of a resolved scenario begins; None: at home. Raises ConfigError if it cannot."""
+    simulation, marker, robot = scenario.simulation, scenario.marker, robot_of(scenario)
+    if not simulation.start.at_valve:
+        return None
+    X_WP = panel_pose(simulation.valve)
+    bar = rot_z(-simulation.valve.bar_angle - max(simulation.valve.position, 0.0))
+    X_WV = compose(X_WP, make(bar, np.zeros(3)), make(np.eye(3), np.array([0, 0, -marker.panel_depth])))
+    along = dict.fromkeys(SIDES, np.array([0.0, 0.0, 1.0]))  # how the wrist cameras look is not known without a lesson
+    stances = Stances(robot, marker, scenario.stance, along, CollisionModel(robot, marker).is_free)
+    base, margin = stances.find(X_WV, scenario.angle)
+    arc = stances.best_arc(compose(inverse(planar(*base)), X_WV), scenario.angle)
+    if margin < 0 or not arc.q:
+        raise ConfigError(f"the hands do not reach the handles of a valve at {simulation.valve.height:g} m")
+    return RobotStart(base, robot.torso.home, arc.q)
+
+
 def initial_commands(scenario: Scenario) -> dict[str, np.ndarray]:
     """The values of the station's inputs before the first command, by port."""
-    robot = robot_of(scenario)
-    arms = robot.split(robot.home)
+    robot, start = robot_of(scenario), start_of(scenario)
+    arms = robot.split(robot.home) if start is None else start.arms
     out = {name: np.zeros(size) for name, size in vectors(robot.groups, "in").items()}
-    out["torso.position_command"] = robot.torso.home
+    out["torso.position_command"] = robot.torso.home if start is None else start.torso
     for side in SIDES:
         out[f"{side}_arm.position_command"] = arms[side]
         out[f"{side}_gripper.position_command"] = np.array([robot.opening])
@@ -221,6 +239,7 @@ def make_station(
         scenario.seed,
         meshcat,
         workers,
+        start_of(scenario),
     )
 
 

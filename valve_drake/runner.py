@@ -59,6 +59,7 @@ from valve_drake.stations.hardware import AHEAD, RobotLink
 from valve_drake.stations.replay import Recording
 from valve_drake.stations.reports import listed
 from valve_drake.task.modes import TERMINAL
+from valve_drake.teaching import prepared
 from valve_drake.versions import versions
 
 STEP = 1 / 32  # between two looks at the mode [s]
@@ -174,8 +175,9 @@ def run(
     scenario = resolve(scenario)
     scenario.check()
     require(scenario.station != "replay", "station", "one that runs (a log is replayed by `replay LOG`)", "replay")
-    files = _read_files(scenario)  # before anything is opened: a scenario that cannot be run leaves no trace
     cv2.setNumThreads(1)  # the same bits on any machine, and the renderer wants the cores
+    named = prepared(scenario, say)  # the log has the scenario as it was given, and the files that were used
+    files = _read_files(named)  # before anything is opened: a scenario that cannot be run leaves no trace
     if scenario.station == "hardware":
         recording = meshcat = False  # 3D views exist in simulation only
     troubles = []
@@ -200,7 +202,7 @@ def run(
         _begin_log(writer, scenario, files)
         sink = writer if live is None else Tee(writer, live)
         recorder = make_recorder(sink, scenario)
-        system = make_diagram(scenario, recorder, meshcat=view, workers=workers, link=link, truth=truth)
+        system = make_diagram(named, recorder, meshcat=view, workers=workers, link=link, truth=truth)
         simulator = Simulator(system.diagram)
         if recording and view is not None:
             view.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat)

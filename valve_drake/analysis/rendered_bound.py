@@ -59,7 +59,8 @@ class _Studio:
         """A place from which both eyes see the marker, in a band of distances [m]."""
         plant, scene = self.rig.plant, self.rig.scene
         while True:
-            start = StartConfig(rng.uniform(band[0], band[1] + 0.6), *(rng.uniform(-a, a) for a in (BEARING, HEADING)))
+            distance, bearing = rng.uniform(band[0], band[1] + 0.6), rng.uniform(-BEARING, BEARING)
+            start = StartConfig(distance, bearing, rng.uniform(-HEADING, HEADING))
             torso = self._robot.torso.home.copy()
             torso[-2] += rng.uniform(*PITCH)  # tilt
             arms = self._robot.split(self._robot.home)

@@ -1,6 +1,7 @@
 """What the hands were taught: the reference image of each green mark, as its feature, and the image Jacobian there."""
 
 import dataclasses as dc
+import math
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -39,12 +40,53 @@ class TaughtReference:
         return d / np.linalg.norm(d)
 
 
+@dc.dataclass(frozen=True)
+class MadeFor:
+    """What references are good for. robot, marker: numbers that differ where these do; opening [m]."""
+
+    robot: str
+    marker: str
+    opening: float
+
+    def unlike(self, other: "MadeFor | None") -> str:
+        """What of the references' own, `other`, is another; "" if they are good. None: their file does not say."""
+        if other is None:
+            return "a robot, marker and opening that it does not name"
+        names = [name for name in ("robot", "marker") if getattr(self, name) != getattr(other, name)]
+        words = [f"another {name}" for name in names]
+        if abs(self.opening - other.opening) > 1e-6:
+            words.append(f"an opening of {1e3 * other.opening:g} mm, not {1e3 * self.opening:g} mm")
+        return " and ".join(words)
+
+
+def load_made_for(path: str | pathlib.Path) -> MadeFor | None:
+    """What the references of a file are good for; None if it does not say. Raises ConfigError."""
+    source = f"taught references {path}"
+    data = _read(path, source).get("made_for")
+    if data is None:
+        return None
+    rule = "a mapping of robot, marker (texts) and opening [m]"
+    try:
+        made = MadeFor(**data)
+    except TypeError:
+        raise ConfigError(f"{source}: made_for must be {rule}") from None
+    good = all(isinstance(text, str) and len(text) <= 64 for text in (made.robot, made.marker))
+    number = isinstance(made.opening, int | float) and math.isfinite(made.opening)
+    if not (good and number):
+        raise ConfigError(f"{source}: made_for must be {rule}")
+    return made
+
+
+def _read(path: str | pathlib.Path, source: str) -> dict[str, Any]:
+    data = yaml_file.read(path, source=source)
+    if not isinstance(data, dict) or set(data) - {"made_for"} != set(SIDES):
+        raise ConfigError(f"{source}: no taught references: must be a mapping of left and right")
+    return data
+
+
 def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
     """Both hands' references. Raises ConfigError that names the file and the key, and never shows a foreign file."""
-    source = f"taught references {path}"
-    data = yaml_file.read(path, source=source)
-    if not isinstance(data, dict) or set(data) != set(SIDES):
-        raise ConfigError(f"{source}: no taught references: must be a mapping of left and right")
+    data = _read(path, f"taught references {path}")
     out = {}
     for side in SIDES:
         values: dict[str, Any] = {}
@@ -66,7 +108,11 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
     return out
 
 
-def save_taught(taught: Mapping[str, TaughtReference], path: str | pathlib.Path, comment: str) -> None:
-    """Writes what `load_taught` reads."""
-    data = {side: {name: np.asarray(getattr(taught[side], name)).tolist() for name in _SHAPES} for side in SIDES}
+def save_taught(
+    taught: Mapping[str, TaughtReference], path: str | pathlib.Path, comment: str, made_for: MadeFor | None = None
+) -> None:
+    """Writes what `load_taught` and `load_made_for` read."""
+    data: dict[str, Any] = {} if made_for is None else {"made_for": dc.asdict(made_for)}
+    for side in SIDES:
+        data[side] = {name: np.asarray(getattr(taught[side], name)).tolist() for name in _SHAPES}
     outputs.write(path, yaml_file.dump(data, comment))

@@ -19,7 +19,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable, Joint, ModelInstanceIndex, PrismaticJoint
 
 from valve_drake.checks import ConfigError, require, shown
-from valve_drake.frames import compose, planar
+from valve_drake.frames import compose, inverse, planar
 from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.robot import description as descriptions
 from valve_drake.robot import kinematics
@@ -193,6 +193,13 @@ class Robot:
         q[self._torso_q] = torso
         self._plant.SetPositions(self._context, q)
         return self._pose(self._eye)
+
+    def X_GC(self, side: str) -> np.ndarray:
+        """The wrist camera in its hand, the arm at home -> (3, 4)."""
+        name = self.description.cameras[f"{side}_wrist"]
+        camera = frame_named(self._plant, self.model.robot, name, f"cameras.{side}_wrist")
+        self._plant.SetPositions(self._context, self._home_q)
+        return compose(inverse(self._pose(self._chains[side].grip)), self._pose(camera))
 
     def head_pose(self, base: np.ndarray, torso: np.ndarray) -> np.ndarray:
         """X_OL for base = (x, y, heading) in O -> (3, 4)."""

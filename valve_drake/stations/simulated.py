@@ -4,6 +4,7 @@ Nothing is welded or moved by hand: the fingers hold the handles by friction and
 (plant_system.py). `truth.*` ports exist here only; the recorder alone reads them.
 """
 
+import dataclasses as dc
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
@@ -252,6 +253,15 @@ def _select(physics: PlantSystem, joints: Sequence[str], what: str) -> np.ndarra
     return picked
 
 
+@dc.dataclass(frozen=True, eq=False)
+class RobotStart:
+    """How a simulated robot begins: base (x, y, heading) in W, torso, and each arm as its encoders read it."""
+
+    base: np.ndarray
+    torso: np.ndarray
+    arms: Mapping[str, np.ndarray]
+
+
 def make_simulated_station(
     simulation: SimulationConfig,
     marker_size: tuple[float, float],
@@ -260,18 +270,22 @@ def make_simulated_station(
     seed: int,
     meshcat: Meshcat | None = None,
     workers: CameraWorkers | None = None,
+    start: RobotStart | None = None,
 ) -> Diagram:
-    """The station as a Diagram, the robot at home. simulation: resolved (no distributions left).
+    """The station as a Diagram. simulation: resolved (no distributions left).
 
-    workers: of `rig_arguments`, make the images; else they are made when they are read.
+    workers: of `rig_arguments`, make the images; else they are made when they are read. start: None: at home, where
+    the simulation's `start` says.
     """
     builder = DiagramBuilder()
     valve = simulation.valve
     offsets = arm_offsets(simulation.error, seed, robot)
-    arms = {side: arm.home - offsets[side] for side, arm in robot.arms.items()}  # home is what the encoders read
-    base = start_pose(simulation.start, valve)
-    start = robot.named(base=base, torso=robot.torso.home, arms=arms, opening=robot.opening)
-    physics = builder.AddSystem(PlantSystem(valve, marker_size, start, offsets, robot))
+    if start is None:
+        home = {side: arm.home for side, arm in robot.arms.items()}
+        start = RobotStart(start_pose(simulation.start, valve), robot.torso.home, home)
+    arms = {side: q - offsets[side] for side, q in start.arms.items()}  # the start is what the encoders read
+    at_start = robot.named(base=start.base, torso=start.torso, arms=arms, opening=robot.opening)
+    physics = builder.AddSystem(PlantSystem(valve, marker_size, at_start, offsets, robot))
     state, plant = physics.GetOutputPort("state"), physics.plant
     for name in COMMANDS:
         builder.ExportInput(physics.GetInputPort(name), name)
