@@ -53,6 +53,7 @@ from valve_drake.stations.hardware import RobotLink, make_hardware_station
 from valve_drake.stations.replay import Recording, make_replay_station
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulated import RobotStart, make_simulated_station, rig_arguments
+from valve_drake.stations.simulation_config import StartConfig
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
 from valve_drake.supervisor.supervisor_system import SupervisorSystem
 from valve_drake.task.modes import BEHAVIORS
@@ -187,18 +188,22 @@ def _check_gaze(search: ValveSearchConfig, robot: Robot) -> None:
 def start_of(scenario: Scenario) -> RobotStart | None:
     """How the simulated robot of a resolved scenario begins; None: at home. Raises ConfigError if it cannot."""
     simulation, marker, robot = scenario.simulation, scenario.marker, robot_of(scenario)
-    if not simulation.start.at_valve:
+    start: StartConfig = simulation.start
+    if not start.at_valve:
         return None
     X_WP = panel_pose(simulation.valve)
     bar = rot_z(-simulation.valve.bar_angle - max(simulation.valve.position, 0.0))
     X_WV = compose(X_WP, make(bar, np.zeros(3)), make(np.eye(3), np.array([0, 0, -marker.panel_depth])))
     along = dict.fromkeys(SIDES, np.array([0.0, 0.0, 1.0]))  # how the wrist cameras look is not known without a lesson
     stances = Stances(robot, marker, scenario.stance, along, CollisionModel(robot, marker).is_free)
-    base, margin = stances.find(X_WV, scenario.angle)
-    arc = stances.best_arc(compose(inverse(planar(*base)), X_WV), scenario.angle)
+    place, margin = stances.find(X_WV, scenario.angle)
+    arc = stances.best_arc(compose(inverse(planar(*place.base)), X_WV), scenario.angle, posture=place.posture)
     if margin < 0 or not arc.q:
         raise ConfigError(f"the hands do not reach the handles of a valve at {simulation.valve.height:g} m")
-    return RobotStart(base, robot.torso.home, arc.q)
+    torso = robot.torso.home.copy()
+    if place.posture is not None:
+        torso[: len(place.posture)] = place.posture
+    return RobotStart(place.base, torso, arc.q)
 
 
 def initial_commands(scenario: Scenario) -> dict[str, np.ndarray]:
