@@ -72,13 +72,12 @@ def test_noise_that_hides_the_mark_in_some_images_does_not_end_it(monkeypatch):
     def noisy(image, config):
         return find(image, config) if next(count) % 8 > 0 else HandleMark(reason="noise")
 
-    monkeypatch.setattr(teaching, "IMAGES", 2)
 
     monkeypatch.setattr(teaching, "find_mark", noisy)
     taught, _ = teaching.teach(scenarios.load(None))
     assert set(taught) == set(SIDES)
     monkeypatch.setattr(teaching, "find_mark", lambda image, config: HandleMark(reason="noise"))
-    with pytest.raises(ConfigError, match="no mark in 5 of 5 left wrist images: noise"):
+    with pytest.raises(ConfigError, match="no mark in 8 of 8 left wrist images: noise"):
         teaching.teach(scenarios.load(None))
 
 
