@@ -50,9 +50,10 @@ from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CONTRACT, vectors
 from valve_drake.stations.hardware import RobotLink, make_hardware_station
+from valve_drake.stations.plant_system import PlantSystem
 from valve_drake.stations.replay import Recording, make_replay_station
 from valve_drake.stations.scene import panel_pose
-from valve_drake.stations.simulated import RobotStart, make_simulated_station, rig_arguments
+from valve_drake.stations.simulated import RobotStart, make_plant, make_simulated_station, rig_arguments
 from valve_drake.stations.simulation_config import StartConfig
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
 from valve_drake.supervisor.supervisor_system import SupervisorSystem
@@ -225,8 +226,10 @@ def make_station(
     recording: Recording | None = None,
     workers: CameraWorkers | None = None,
     link: RobotLink | None = None,
+    physics: PlantSystem | None = None,
 ) -> Diagram:
-    """The station of a resolved scenario. recording: for station `replay`; link: for station `hardware`."""
+    """The station of a resolved scenario. recording: for station `replay`; link: for station `hardware`; workers and
+    physics: of `rig_of` and `plant_of`, for station `simulated`."""
     if scenario.station == "hardware":
         return make_hardware_station(
             RobotLink(Bus(scenario.hardware), robot_of(scenario).groups) if link is None else link
@@ -244,8 +247,14 @@ def make_station(
         scenario.seed,
         meshcat,
         workers,
-        start_of(scenario),
+        physics or plant_of(scenario),
     )
+
+
+def plant_of(scenario: Scenario) -> PlantSystem:
+    """The plant of a resolved scenario of station `simulated`."""
+    size = (scenario.marker.size[0], scenario.marker.size[1])
+    return make_plant(scenario.simulation, size, robot_of(scenario), scenario.seed, start_of(scenario))
 
 
 def rig_of(scenario: Scenario) -> tuple[Any, ...]:
@@ -307,16 +316,18 @@ def make_diagram(
     recording: Recording | None = None,
     workers: CameraWorkers | None = None,
     link: RobotLink | None = None,
+    physics: PlantSystem | None = None,
     truth: bool = True,
     added: Mapping[LeafSystem, Mapping[str, str]] | None = None,
 ) -> System:
     """The whole system for a resolved scenario; `recording` is what station `replay` shows, `link` leads to a robot.
 
-    workers: of `rig_of`, render the simulated cameras' images in other processes. truth=False: the recorder gets no
-    `truth.*` ports. added: systems of one's own, and for each of their input ports "<block>.<port>" that it reads.
+    workers: of `rig_of`, render the simulated cameras' images in other processes. physics: of `plant_of`, else it is
+    made. truth=False: the recorder gets no `truth.*` ports. added: systems of one's own, and for each of their input
+    ports "<block>.<port>" that it reads.
     """
     builder = DiagramBuilder()
-    station = builder.AddSystem(make_station(scenario, meshcat, recording, workers, link))
+    station = builder.AddSystem(make_station(scenario, meshcat, recording, workers, link, physics))
     station.set_name("station")  # whichever it is: the wiring is the same
     blocks = {block.get_name(): block for block in make_blocks(scenario)}
     for block in blocks.values():

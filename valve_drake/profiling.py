@@ -38,7 +38,7 @@ class Spent:
     rendering: float  # in the renderers
     other: float  # beside the advances: threads of the views, display, link
     end: float  # completing the log, its numbers, the 3D recording
-    waited: float  # for images [s, wall]: no processor time
+    waited: float  # for images and the plant [s, wall]: no processor time
 
     def parts(self) -> dict[str, float]:
         """Processor seconds by kind of work, the stages as one."""
@@ -76,7 +76,8 @@ class Profile:
         self._wall = self._processor = 0.0  # of all advances
         self._phases: dict[str, float] = {}
         self._marked = time.process_time()
-        self.imports = self.renderers_start_up = self.rendering = self.writing = 0.0  # processor time, told by others
+        # Processor time, told by others [s].
+        self.imports = self.renderers_start_up = self.rendering = self.writing = self.plant_beside = 0.0
 
     def __enter__(self) -> None:
         pass
@@ -120,7 +121,7 @@ class Profile:
             imports=self.imports,
             start_up=start_up,
             renderers_start_up=self.renderers_start_up,
-            plant=plant or None,
+            plant=plant + self.plant_beside or None,
             framework=self._processor - sum(stages.values()) - images - logging - plant,
             stages=stages,
             images=images,

@@ -27,7 +27,7 @@ from valve_drake.behaviors.taught import load_taught
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError, OperationFailed, require
 from valve_drake.config import key_names
-from valve_drake.diagram import System, command, deliver, listens, make_diagram, rig_of, robot_of
+from valve_drake.diagram import System, command, deliver, listens, make_diagram, plant_of, rig_of, robot_of
 from valve_drake.messages import Mode, ModeState, OperatorCommand, OperatorPackets, Verdict
 from valve_drake.operator.operator_link import OperatorLink
 from valve_drake.pace import PACE, Pace, Pacer
@@ -183,13 +183,15 @@ def run(
     troubles = []
     with contextlib.ExitStack() as stack:
         profile = stack.enter_context(profiling.measure())
-        workers = None
+        workers = physics = plant_beside = None
         if scenario.station == "hardware":
             link = link or RobotLink(Bus(scenario.hardware), robot_of(scenario).groups, stop=stop)
         else:
             workers = stack.enter_context(
                 CameraWorkers(*rig_of(scenario))
             )  # before view and writer, which start threads
+            physics = plant_of(named)
+            plant_beside = stack.enter_context(physics.beside())
         if listens(scenario) and operators is None:
             shared = link.bus if link is not None and scenario.station == "hardware" else None
             operators = OperatorLink(shared or Bus(scenario.hardware), alone=shared is None)
@@ -202,7 +204,9 @@ def run(
         _begin_log(writer, scenario, files)
         sink = writer if live is None else Tee(writer, live)
         recorder = make_recorder(sink, scenario)
-        system = make_diagram(named, recorder, meshcat=view, workers=workers, link=link, truth=truth)
+        system = make_diagram(
+            named, recorder, meshcat=view, workers=workers, link=link, physics=physics, truth=truth
+        )
         simulator = Simulator(system.diagram)
         if recording and view is not None:
             view.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat)
@@ -243,6 +247,8 @@ def run(
         profile.ends(profiling.ADVANCES)
         if workers is not None:
             profile.renderers_start_up, profile.rendering = workers.spent
+        if plant_beside is not None:
+            profile.plant_beside = plant_beside.spent
         writer.write_metadata("result", _result_metadata(mode, end))
     if writer.error and not told:
         say(writer.error)

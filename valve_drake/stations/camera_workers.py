@@ -8,7 +8,6 @@ does: the same bits as `CameraRig.frame`, sooner. A wrong guess costs time and c
 import collections
 import contextlib
 import dataclasses as dc
-import gc
 import multiprocessing.connection
 import multiprocessing.context
 import os
@@ -25,6 +24,7 @@ import cv2
 import numpy as np
 
 from valve_drake import profiling
+from valve_drake.beside import can_fork, fork
 from valve_drake.checks import OperationFailed
 from valve_drake.messages import CameraFrame
 from valve_drake.stations import render_egl
@@ -33,7 +33,6 @@ from valve_drake.stations.contract import CAMERAS, HEAD, MATE, WRISTS
 
 WORKERS = 2
 NICENESS = 5  # of the processes: the run goes first where processors are few. 0 where a late image does more harm
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # that the program answers in its own way
 KEPT = 8  # captures of a camera that may still be asked for
 
 
@@ -173,23 +172,15 @@ def _recv(wire: multiprocessing.connection.Connection) -> Any:
 
 
 def _can_fork() -> bool:
-    """Whether a copy of this process would work: without threads, and without OpenGL, that is no copy of its own."""
-    try:
-        return len(os.listdir("/proc/self/task")) == 1 and not render_egl.is_open()
-    except OSError:  # no Linux
-        return False
+    """Whether a copy of this process would work: also without OpenGL, that is no copy of its own."""
+    return can_fork() and not render_egl.is_open()
 
 
 def _fork(
     rig: CameraRig, fd: int, niceness: int, mine: Sequence[multiprocessing.connection.Connection]
 ) -> tuple[multiprocessing.context.ForkProcess, Callable[[], int]]:
     """A copy of this process serves `fd`; mine: wires of this process, that the copy must not keep open."""
-    process = multiprocessing.context.ForkProcess(target=_serve_copy, args=(rig, fd, niceness, mine), daemon=True)
-    old = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until the copy has put away the program's answers
-    try:
-        process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, old)
+    process = fork(_serve_copy, rig, fd, niceness, mine)
 
     def wait() -> int:
         process.join()
@@ -199,13 +190,8 @@ def _fork(
 
 
 def _serve_copy(rig: CameraRig, fd: int, niceness: int, mine: Sequence[multiprocessing.connection.Connection]) -> None:
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     for wire in mine:
         wire.close()
-    os.setpgid(0, 0)  # a terminal's signals are for the run; in its session Linux weighs both by their niceness
-    gc.freeze()  # what was copied stays shared
     serve(fd, niceness, rig)
 
 
@@ -215,7 +201,7 @@ def _spawn(fd: int, niceness: int) -> tuple[subprocess.Popen[bytes], Callable[[]
     process = subprocess.Popen(
         [sys.executable, "-c", code],
         pass_fds=[fd],
-        process_group=0,  # as in _serve_copy
+        process_group=0,  # as in a copy
     )
     return process, process.wait
 

@@ -7,10 +7,11 @@ is scratch paper, written from that state before every step. A Context of the st
 restored and advanced again to the same bits.
 """
 
+import contextlib
+import itertools
 import math
 import threading
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from pydrake.geometry import SceneGraph
@@ -25,6 +26,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource
 
 from valve_drake import profiling
+from valve_drake.beside import Beside
 from valve_drake.checks import require
 from valve_drake.messages import SIDES
 from valve_drake.ports import SLOT, TICK, PythonSystem
@@ -44,15 +46,6 @@ STEM = "stem"  # the valve's joint, and the output port of its load
 _Pose = tuple[float, float, float]  # x, y, heading [m, rad]
 
 
-class Stepped(NamedTuple):
-    """The plant after a tick."""
-
-    x: np.ndarray  # positions and velocities (nx,)
-    base: np.ndarray  # set point x, y, heading (3,) [m, rad]
-    actuation: np.ndarray  # of the robot's actuators during the last step (n,) [N m, N]
-    loads: list[np.ndarray]  # on the wrist sensors and the stem during the last step (6,) [N m, N]
-
-
 class PlantSystem(PythonSystem):
     """Advances the plant once a tick, in slot 2, by the commands of the tick before.
 
@@ -69,6 +62,10 @@ class PlantSystem(PythonSystem):
     and the ports show the state of t_(k+1) from slot 2 of tick k to slot 2 of tick k + 1. That is the present state
     for whoever reads in slot 0 or 1 (cameras, truth, robot_state); wrist sensors and odometry read it in slot 3 for
     robot_state to find at t_(k+1).
+
+    What a tick does to the plant depends on its state and those commands alone, which are known when slot 2 of the tick
+    before is over. While `beside` is open, slot 3 hands both to a copy of the process, and slot 2 of the next tick
+    fetches the same bits that it would compute: robot_state, the behaviours and the recorder work meanwhile.
 
     Servos: joints are implicit PD servos with effort limits. Arms and torso are sent positions, with v_d = 0. The
     base's set point is the integral of its twist. A finger's is clipped about its position at each step, so that the
@@ -134,6 +131,7 @@ class PlantSystem(PythonSystem):
 
         sizes = vectors(robot.groups, "in")
         self._inputs = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
+        self._reads = [port.Eval for port in self._inputs.values()]
         self._scratch = self.diagram.CreateDefaultContext()
         self._lock = threading.Lock()  # of the scratch: two threads may advance two Contexts
         self._inner = self.plant.GetMyMutableContextFromRoot(self._scratch)
@@ -146,13 +144,18 @@ class PlantSystem(PythonSystem):
         self._loads = [self.plant.GetJointByName(name).index() for name in loaded.values()]
         self._x = self.DeclareDiscreteState(self.plant.GetPositionsAndVelocities(self._inner))
         self._base = self.DeclareDiscreteState([start[name] for name in self.base])
-        self._actuation = self.DeclareDiscreteState(len(self.actuated))
-        self._load = [self.DeclareDiscreteState(6) for _ in loaded]
+        self._actuation = self.DeclareDiscreteState(len(self.actuated))  # of the robot's actuators, in the last step
+        self._load = [self.DeclareDiscreteState(6) for _ in loaded]  # [torque; force], in the last step
+        nx = self.plant.num_multibody_states()
+        self._parts = [nx, len(self.base), len(self.actuated), *(6 for _ in loaded)]  # sizes of what a tick makes
+        self._ends = list(itertools.accumulate([nx, len(self.base), *sizes.values()]))  # in what it is made of
+        self._beside: Beside | None = None
         self.DeclareStateOutputPort("state", self._x)
         self.DeclareStateOutputPort("actuation", self._actuation)
         for name, index in zip(loaded, self._load):
             self.DeclareStateOutputPort(name, index)
         self.DeclarePeriodicUnrestrictedUpdateEvent(TICK, 2 * SLOT, self._update)
+        self.DeclarePeriodicPublishEvent(TICK, 3 * SLOT, self._begin)
 
     def plant_context(self, root: Context) -> Context:
         """A new Context of `plant` with the positions, velocities and commands that `root` holds, for any question to
@@ -220,20 +223,43 @@ class PlantSystem(PythonSystem):
             q = float(x[position])
             desired[at] = q + min(max(goal - q, -reach), reach)
 
-    def _update(self, context: Context, state: State) -> None:
-        x, base = (context.get_discrete_state(index).value() for index in (self._x, self._base))
-        commands = self._commands(context)
-        with profiling.work(profiling.PLANT), self._lock:
-            after = self._advance(x, base, commands)
-        values = state.get_mutable_discrete_state()
-        for index, value in zip(
-            (self._x, self._base, self._actuation, *self._load),
-            (after.x, after.base, after.actuation, *after.loads),
-        ):
-            values.set_value(index, value)
+    @contextlib.contextmanager
+    def beside(self) -> Iterator[Beside]:
+        """While open, the plant is advanced beside the blocks, in a copy of this process where one can be made."""
+        with Beside(self._advance, self._ends[-1], sum(self._parts)) as self._beside:
+            try:
+                yield self._beside
+            finally:
+                self._beside = None
 
-    def _advance(self, x: np.ndarray, base: np.ndarray, commands: dict[str, np.ndarray]) -> Stepped:
-        """One tick. It depends on the arguments alone."""
+    def _question(self, context: Context) -> np.ndarray:
+        """All that the next tick depends on: x, the base's set point, the commands."""
+        state = context.get_discrete_state()
+        parts = (state.value(self._x), state.value(self._base), *(read(context) for read in self._reads))
+        return np.concatenate(parts)
+
+    def _begin(self, context: Context) -> None:
+        if self._beside is not None:
+            with profiling.work(profiling.PLANT):
+                self._beside.begin(self._question(context))
+
+    def _update(self, context: Context, state: State) -> None:
+        with profiling.work(profiling.PLANT):
+            question = self._question(context)
+            answer = self._advance(question) if self._beside is None else self._beside.answer(question)
+        values = state.get_mutable_discrete_state()
+        start = 0
+        for index, size in zip((self._x, self._base, self._actuation, *self._load), self._parts):
+            values.set_value(index, answer[start : start + size])
+            start += size
+
+    def _advance(self, question: np.ndarray) -> np.ndarray:
+        """One tick. It depends on the question alone -> x, the base's set point, actuation and loads ."""
+        x, base, *commands = (question[a:b] for a, b in itertools.pairwise((0, *self._ends)))
+        with self._lock:
+            return np.concatenate(self._step(x, base, dict(zip(self._inputs, commands))))
+
+    def _step(self, x: np.ndarray, base: np.ndarray, commands: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
         scratch, desired = self._scratch, self._desired
         start: _Pose = tuple(base.tolist())
         twist: tuple[float, float] = tuple(commands["base.twist_command"].tolist())
@@ -252,10 +278,10 @@ class PlantSystem(PythonSystem):
             if k < STEPS - 1:
                 scratch.SetDiscreteState(x)
         # The last step is not taken in the scratch, so what the outputs need of it is in the cache.
-        actuation = np.array(self._net_actuation.Eval(self._inner))
+        actuation = self._net_actuation.Eval(self._inner)
         forces = self._reaction_forces.Eval(self._inner)
         loads = [forces[k].get_coeffs() for k in self._loads]
-        return Stepped(np.array(x), np.array(_driven(start, twist, TICK)), actuation, loads)
+        return x, np.array(_driven(start, twist, TICK)), actuation, *loads
 
 
 def _opening(gripper: Gripper, side: str) -> tuple[float, float]:

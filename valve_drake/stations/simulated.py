@@ -262,6 +262,25 @@ class RobotStart:
     arms: Mapping[str, np.ndarray]
 
 
+def make_plant(
+    simulation: SimulationConfig,
+    marker_size: tuple[float, float],
+    robot: Robot,
+    seed: int,
+    start: RobotStart | None = None,
+) -> PlantSystem:
+    """The station's plant. simulation: resolved (no distributions left). start: None: at home, where the simulation's
+    `start` says."""
+    valve = simulation.valve
+    offsets = arm_offsets(simulation.error, seed, robot)
+    if start is None:
+        home = {side: arm.home for side, arm in robot.arms.items()}
+        start = RobotStart(start_pose(simulation.start, valve), robot.torso.home, home)
+    arms = {side: q - offsets[side] for side, q in start.arms.items()}  # the start is what the encoders read
+    at_start = robot.named(base=start.base, torso=start.torso, arms=arms, opening=robot.opening)
+    return PlantSystem(valve, marker_size, at_start, offsets, robot)
+
+
 def make_simulated_station(
     simulation: SimulationConfig,
     marker_size: tuple[float, float],
@@ -270,22 +289,17 @@ def make_simulated_station(
     seed: int,
     meshcat: Meshcat | None = None,
     workers: CameraWorkers | None = None,
-    start: RobotStart | None = None,
+    physics: PlantSystem | None = None,
 ) -> Diagram:
     """The station as a Diagram. simulation: resolved (no distributions left).
 
-    workers: of `rig_arguments`, make the images; else they are made when they are read. start: None: at home, where
-    the simulation's `start` says.
+    workers: of `rig_arguments`, make the images; else they are made when they are read. physics: of `make_plant`, else
+    it is made, the robot at home.
     """
     builder = DiagramBuilder()
     valve = simulation.valve
     offsets = arm_offsets(simulation.error, seed, robot)
-    if start is None:
-        home = {side: arm.home for side, arm in robot.arms.items()}
-        start = RobotStart(start_pose(simulation.start, valve), robot.torso.home, home)
-    arms = {side: q - offsets[side] for side, q in start.arms.items()}  # the start is what the encoders read
-    at_start = robot.named(base=start.base, torso=start.torso, arms=arms, opening=robot.opening)
-    physics = builder.AddSystem(PlantSystem(valve, marker_size, at_start, offsets, robot))
+    physics = builder.AddSystem(make_plant(simulation, marker_size, robot, seed) if physics is None else physics)
     state, plant = physics.GetOutputPort("state"), physics.plant
     for name in COMMANDS:
         builder.ExportInput(physics.GetInputPort(name), name)
