@@ -265,6 +265,18 @@ def test_a_lost_link_in_a_run_leads_where_the_scenario_says(mode, on_loss):
         assert (Mode.RELEASE in bench.supervisor.entered) == TABLE[mode].contact
 
 
+def test_a_desk_that_leaves_gives_the_ear_back_at_once_and_loses_its_link():
+    bench = Bench().opening(Mode.TURN)
+    bench.cut = True
+    last = dc.replace(bench.desks[0].packet(bench.time + DT), words="", leaves=True)
+    bench.wire.append((bench.time, last))
+    bench.run(0.1)
+    assert bench.commands == ["open", "hold"] and bench.shown.says == "the operator has left: the grasp is held"
+    bench.desks, bench.cut = [Desk(BOB)], False
+    assert bench.run(0.2).shown.speaker == BOB
+    assert bench.say("confirm").commands[-1] == "resume"
+
+
 def test_a_short_gap_is_no_loss():
     bench = Bench().opening(Mode.TURN)
     moved_on(bench, 0.8).cut = False

@@ -346,6 +346,7 @@ class OperatorPacket(Message):
     begin: float = 0.0  # of the sound that they were heard in [s]
     end: float = 0.0
     typed: bool = False  # not heard, but entered
+    leaves: bool = False  # it gives the robot's ear back
 
 
 @dc.dataclass(frozen=True, eq=False)

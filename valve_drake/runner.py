@@ -196,6 +196,7 @@ def run(
             shared = link.bus if link is not None and scenario.station == "hardware" else None
             operators = OperatorLink(shared or Bus(scenario.hardware), alone=shared is None)
             operators.claim(stop)
+            say(f"operators are heard on {scenario.hardware.lcm_url}: valve-drake operator")
         view = _make_view(say if meshcat else None) if recording or meshcat else None
         writer = LogWriter(log, companions=(".json", ".html") if recording else (".json",), overwrite=overwrite)
         stack.enter_context(_log_kept(writer))

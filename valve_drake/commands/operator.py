@@ -43,7 +43,6 @@ def add(commands: Subcommands) -> None:
     p.add_argument(
         "--radio", action="store_true", help="with --file: puts the sound on the bus, and says nothing itself"
     )
-    p.add_argument("--wait", action="store_true", help="with --say or --file: until the run that was begun has ended")
     p.add_argument("--json", action="store_true", help="with --say or --file: print one JSON object")
     p.set_defaults(command=command)
 
@@ -57,8 +56,7 @@ def command(options: argparse.Namespace) -> int:
 
     require(not options.radio or options.file is not None, "--radio", "given with --file", options.radio)
     scripted = bool(options.say) or options.file is not None
-    for name in ("wait", "json"):
-        require(scripted or not getattr(options, name), f"--{name}", "given with --say or --file", True)
+    require(scripted or not options.json, "--json", "given with --say or --file", True)
     require(scripted or sys.stdin.isatty(), "standard input", "a terminal, or --say or --file given", "none")
     scenario = scenarios.load(options.scenario, options.set)
     sound = ear.read_wav(options.file, "--file") if options.file is not None else None
@@ -82,7 +80,10 @@ def command(options: argparse.Namespace) -> int:
             desk.sound(samples)
         desk.poll()
 
-    return _script(desk, poll, options, sound) if scripted else _sit(desk, poll)
+    try:
+        return _script(desk, poll, options, sound) if scripted else _sit(desk, poll)
+    finally:
+        link.leave()
 
 
 # ---------------------------------------------------------------- at the terminal
@@ -166,7 +167,10 @@ def _send(link: "DeskLink", sound: "np.ndarray") -> int:
 
 
 def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace, sound: "np.ndarray | None") -> int:
-    """Says all that was given -> whether nothing was refused and, with --wait, the valve was turned."""
+    """Says all that was given, and waits for the end of a run that it began: whoever leaves loses the link.
+
+    Exit 0: nothing was refused, and the valve was turned if it was asked for.
+    """
     from valve_drake.operator.desk import transcript
     from valve_drake.operator.ear import PIECE, pieces
     from valve_drake.operator.grammar import Heard
@@ -210,13 +214,14 @@ def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace,
                 until(lambda due=begin + (k + 1) * PIECE: time.monotonic() >= due, 2 * PIECE)  # type: ignore[misc]
                 desk.sound(piece)
             until(lambda: not link.waiting, ANSWER)
-        until(lambda: False, 4 * POLL)  # what the robot says last
-        if options.wait:
-            until(lambda: link.state.done or not link.linked, float("inf"))
+        until(lambda: False, 0.3)  # what the robot says last
+        begun = link.commanding and link.state.task > 0
+        if begun:
+            until(lambda: link.state.done or not link.commanding, float("inf"))
             until(lambda: False, 4 * POLL)
     state = link.state
     refused = [outcome for outcome in outcomes if outcome in ("refused", "ignored")]
-    good = not refused and link.commanding and not (options.wait and state.verdict != "turned")
+    good = not refused and link.commanding and not (begun and state.verdict != "turned")
     if options.json:
         said = [{"time_s": line.time, "who": line.who, "text": line.text} for line in desk.lines]
         facts = {"mode": state.mode, "done": state.done, "verdict": state.verdict, "reason": state.reason}

@@ -62,7 +62,7 @@ class Desk:
         self.left = False
         self._ear, self._send_sound, self._clock = ear, send_sound, clock
         self._begun = clock()
-        self._answers = 0
+        self._answers = self._program = 0
         self._asked_to_leave = False
         self._sounds = 0
         self._level = 0.0
@@ -131,6 +131,8 @@ class Desk:
         """Listens and speaks on the wire; to be called some 50 times a second."""
         self.link.poll()
         state = self.link.state
+        if self.link.program != self._program:  # what it said before was not for this desk
+            self._program, self._answers = self.link.program, state.answers
         if state.answers != self._answers:
             self._answers = state.answers
             if state.says:

@@ -117,6 +117,11 @@ class DeskLink:
         if now - self._sent_at >= ANNOUNCED:
             self._send(now)
 
+    def leave(self) -> None:
+        """Gives the robot's ear back: the end of this desk."""
+        now = self.clock()
+        self.bus.send(WORDS, words_message(OperatorPacket(self.number, now, said=now, leaves=True), self.program))
+
     def _begin(self, said: float, heard: Heard) -> None:
         self._sequence += 1
         self._current = OperatorPacket(

@@ -1,7 +1,7 @@
 """The operators' channel: who commands, what was said, and what comes of it. One pure step.
 
-One operator has the robot's ear: who speaks first, until it was silent for `lease`. Others are refused by their
-number, but a `stop` is obeyed whoever says it. A packet that was said again or overtaken counts as none; words that
+One operator has the robot's ear: who speaks first, until it leaves or was silent for `lease`. Others are refused by
+their number, but a `stop` is obeyed whoever says it. A packet that was said again or overtaken counts as none; words that
 come more than `late` after they were said are refused, as is what is not of the grammar (grammar.py). An operator's
 clock is placed on this one by the least delay that its packets had.
 
@@ -160,6 +160,8 @@ def _hear(
         + tuple(one for one in others if one.number != s.holder)[-(SPEAKERS - 2) :]
     )
     s = changed(s, speakers=(*kept, known))
+    if packet.leaves:
+        return changed(_lose(config, s, mode, "the operator has left"), holder=0) if packet.speaker == s.holder else s
     if in_time and (s.holder == 0 or s.lost):
         s = _take_ear(s, packet.speaker, mode)
     if not new:
@@ -185,7 +187,7 @@ def _hear(
 def _take_ear(s: State, speaker: int, mode: ModeState) -> State:
     begun = changed(s, holder=speaker, lost=False, talk=Talk())
     if speaker != s.holder:
-        begun = changed(begun, shown=dc.replace(begun.shown, heard=0, words="", score=0.0, outcome="", other=0))
+        begun = changed(begun, shown=dc.replace(begun.shown, heard=0, words="", score=0.0, outcome="", other=0, task=0))
     held = "the grasp is held: say confirm to go on, or stop" if mode.held else "at your service"
     return _answer(begun, held)
 
@@ -195,15 +197,19 @@ def _watch(config: OperatorChannelConfig, s: State, time: float, mode: ModeState
     if s.holder == 0 or s.lost:
         return s
     last = next(one.last for one in s.speakers if one.number == s.holder)
-    if time - last <= config.lease:
+    return s if time - last <= config.lease else _lose(config, s, mode, "the link is lost")
+
+
+def _lose(config: OperatorChannelConfig, s: State, mode: ModeState, why: str) -> State:
+    if s.lost:
         return s
     s = changed(s, lost=True, talk=Talk(), follows=None)
     moving = mode.mode in RUNNING and not TABLE[Mode(mode.mode)].ending
     if not moving or config.on_loss == "finish":
-        return _answer(s, "the link is lost" + (": the run goes on" if moving else ""))
+        return _answer(s, why + (": the run goes on" if moving else ""))
     if config.on_loss == "hold" and mode.mode in HOLDS:
-        return _answer(_give(s, "hold"), "the link is lost: the grasp is held")
-    return _answer(_give(s, "stop"), "the link is lost: stop")
+        return _answer(_give(s, "hold"), f"{why}: the grasp is held")
+    return _answer(_give(s, "stop"), f"{why}: stop")
 
 
 # ---------------------------------------------------------------- what was said

@@ -59,7 +59,7 @@ def _whole(values: Mapping[str, float], name: str, least: int = 0) -> int:
 def words_message(packet: OperatorPacket, to: int) -> lcmt_drake_signal:
     """operator.words, for the program with the number `to`."""
     numbers = {"to": to, "instance": packet.speaker, "sequence": packet.sequence}
-    numbers |= {name: getattr(packet, name) for name in ("score", "said", "begin", "end", "typed")}
+    numbers |= {name: getattr(packet, name) for name in ("score", "said", "begin", "end", "typed", "leaves")}
     message = _named({name: float(value) for name, value in numbers.items()}, {_WORDS: packet.words})
     message.timestamp = to_utime(packet.sent)
     return message
@@ -84,6 +84,7 @@ def read_words(message: lcmt_drake_signal) -> tuple[int, OperatorPacket]:
         begin=begin,
         end=end,
         typed=values.get("typed") == 1.0,
+        leaves=values.get("leaves") == 1.0,
     )
     if not said <= packet.sent + 1e-3:  # the stamp is rounded
         raise WrongMessage("words that will be said later")

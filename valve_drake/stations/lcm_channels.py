@@ -279,8 +279,8 @@ def _rows() -> Iterable[Channel]:
         WORDS, OPERATOR, lcmt_drake_signal, "every 1/8 s, and at once when something is said",
         "to: `instance` of operator.report; instance: a random number of this operator's desk; sequence: counts what "
         "was said, 0: nothing yet; score: 0 to 1, how sure the recogniser was; said, begin, end: when the words were "
-        "complete, and of their sound, on the clock of the stamp [s]; typed: 1 if they were not heard; and 1 under "
-        "`words: ` with the words", stamp="timestamp", between=OPERATOR,
+        "complete, and of their sound, on the clock of the stamp [s]; typed: 1 if they were not heard; leaves: 1 "
+        "with the last one of a desk; and 1 under `words: ` with the words", stamp="timestamp", between=OPERATOR,
     )  # fmt: skip
     yield Channel(
         AUDIO, OPERATOR, lcmt_image, "while somebody listens by microphone or radio",
