@@ -72,7 +72,6 @@ def test_noise_that_hides_the_mark_in_some_images_does_not_end_it(monkeypatch):
     def noisy(image, config):
         return find(image, config) if next(count) % 8 > 0 else HandleMark(reason="noise")
 
-
     monkeypatch.setattr(teaching, "find_mark", noisy)
     taught, _ = teaching.teach(scenarios.load(None))
     assert set(taught) == set(SIDES)

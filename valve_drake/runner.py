@@ -205,9 +205,7 @@ def run(
         _begin_log(writer, scenario, files)
         sink = writer if live is None else Tee(writer, live)
         recorder = make_recorder(sink, scenario)
-        system = make_diagram(
-            named, recorder, meshcat=view, workers=workers, link=link, physics=physics, truth=truth
-        )
+        system = make_diagram(named, recorder, meshcat=view, workers=workers, link=link, physics=physics, truth=truth)
         simulator = Simulator(system.diagram)
         if recording and view is not None:
             view.StartRecording(frames_per_second=16.0, set_visualizations_while_recording=meshcat)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from valve_drake.analysis import two_logs
+from valve_drake.analysis.conversation import waveform
 from valve_drake.analysis.plots import Line, Plot
 from valve_drake.analysis.traces import Traces
 from valve_drake.messages import SIDES, Mode
@@ -33,8 +34,9 @@ def make_plots(log: Traces) -> list[Plot]:
         _angle_difference,
         _tracking,
         _health,
+        waveform,
     )
-    plots = [log.attempt(f"plot {make.__name__[1:]}", functools.partial(make, log), None) for make in makers]
+    plots = [log.attempt(f"plot {make.__name__.lstrip('_')}", functools.partial(make, log), None) for make in makers]
     return [plot if plot is not None else Plot("", "", []) for plot in plots]
 
 

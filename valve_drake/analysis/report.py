@@ -19,6 +19,7 @@ from markupsafe import Markup
 from valve_drake import yaml_file
 from valve_drake.analysis import two_logs
 from valve_drake.analysis.comparison import Divergence
+from valve_drake.analysis.conversation import exchanges
 from valve_drake.analysis.curves import make_plots, overlaid
 from valve_drake.analysis.integrity import Integrity, examine, words
 from valve_drake.analysis.metrics import Summary, summarize
@@ -246,6 +247,7 @@ def page(review: Review, link_base: Path) -> str:
             span=(start, end),
             moments=review.traces.attempt("pictures", lambda: album.changes_of_mode(spans[:MOMENTS]), []),
             worst=worst,
+            said=review.traces.attempt("the conversation", lambda: exchanges(review.log), []),
             log_lines=review.traces.attempt("/log", lambda: _log_lines(review.log), []),
             recording=_link(review.recording, link_base),
             geometry={"width": WIDTH, "left": LEFT, "right": RIGHT},

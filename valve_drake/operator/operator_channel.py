@@ -1,9 +1,9 @@
 """The operators' channel: who commands, what was said, and what comes of it. One pure step.
 
 One operator has the robot's ear: who speaks first, until it leaves or was silent for `lease`. Others are refused by
-their number, but a `stop` is obeyed whoever says it. A packet that was said again or overtaken counts as none; words that
-come more than `late` after they were said are refused, as is what is not of the grammar (grammar.py). An operator's
-clock is placed on this one by the least delay that its packets had.
+their number, but a `stop` is obeyed whoever says it. A packet that was said again or overtaken counts as none; words
+that come more than `late` after they were said are refused, as is what is not of the grammar (grammar.py). An
+operator's clock is placed on this one by the least delay that its packets had.
 
 What is given goes to the supervisor as OperatorCommand. A new move after a run that is done or was stopped needs no
 `reset`; after one that has failed it does. When the link is lost, `on_loss` says what becomes of a run that is on its
