@@ -330,7 +330,7 @@ def test_a_wrist_never_swings_round_at_its_limit():
     q = (np.array([1.05, 0.65, -1.9, 3.315, 1.25, 0.0]), np.array([1.05, -0.65, 1.9, 0, -1.25, 0]))
     X = tuple(ROBOT.forward(side, q[k]) for k, side in enumerate(SIDES))
     beyond = (ROBOT.forward(LEFT, q[0] + [0, 0, 0, 0.02, 0, 0]), X[1])
-    memory = law._command(Memory(X=X, q=q), beyond)
+    memory = law._command(Memory(X=X, q=q), beyond, np.zeros(0))
     assert np.array_equal(memory.q[0], q[0]) and memory.X[0] is X[0]
     assert memory.X[1] is X[1] and memory.q[1] == pytest.approx(q[1], abs=1e-9)
 

@@ -13,7 +13,7 @@ FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the val
 
 
 class CollisionModel:
-    """Robot at the base's origin with its head at home, and a valve that can be put anywhere.
+    """Robot at the base's origin with its head at home, lift and waist as asked, and a valve that can be put anywhere.
 
     ignored: pairs of links that may touch, since they do at home (robot.yaml's `collision.ignore`).
     clearance: least distance that counts as free; a larger one forbids poses near the valve [m]; None: the robot's.
@@ -54,7 +54,7 @@ class CollisionModel:
         plant, context = self._plant, self._context
         positions = self._rest.copy()
         positions[self._arms] = q
-        if posture is not None:
+        if posture is not None and len(posture):
             positions[self._posture] = posture
         plant.SetPositions(context, positions)
         X_BP = FAR if X_BV is None else compose(X_BV, make(np.eye(3), np.array([0, 0, self._panel_depth])))
@@ -67,7 +67,7 @@ class CollisionModel:
     def is_free(self, X_BV: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None) -> bool:
         """True if no two bodies are nearer than the clearance.
 
-        X_BV: marker in the base (None: no valve); q: both arms; posture: lift and waist (None: at home).
+        X_BV: marker in the base (None: no valve); q: both arms; posture: lift and waist (None or empty: at home).
         """
         return len(self._near(X_BV, q, posture)) == 0
 

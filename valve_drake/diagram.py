@@ -88,6 +88,7 @@ WIRES: tuple[tuple[str, str], ...] = (
     # between behaviours: where to stand, what to grasp, how far it was turned
     ("rectangle_estimator.estimate", "stance_planner.estimate"),
     ("stance_planner.stance", "base_approach.stance"),
+    ("stance_planner.stance", "valve_search.stance"),
     ("kinematic_approach.request", "stance_planner.request"),
     ("stance_planner.grasps", "kinematic_approach.grasps"),
     ("stance_planner.path", "kinematic_approach.path"),
@@ -155,7 +156,6 @@ def robot_of(scenario: Scenario) -> Robot:
     robot = Robot.load(named_files.find(scenario, "robot"))
     d = robot.description
     try:
-        require(not d.lift.joints, "lift.joints", "none (a lift is not supported yet)", d.lift.joints)
         require(d.servo == "camera", "servo", "camera (another way is not supported yet)", d.servo)
         require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
         _check_gaze(scenario.valve_search, robot)

@@ -140,6 +140,11 @@ class RobotState(Message):
     right_wrench: np.ndarray = array(6)
     history: np.ndarray = array(-1, -1)  # rows, oldest first: t, x, y, heading, torso
 
+    @property
+    def posture(self) -> np.ndarray:
+        """Lift and waist, as far as there are -> (n,); empty before they were measured."""
+        return self.torso[:-2]
+
     def head_at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Base (x, y, heading) and torso angles at `time`, interpolated -> (3,), (3,)."""
         if len(self.history) == 0:
@@ -441,6 +446,7 @@ class PlanRequest(Message):
     kind: str = ""
     valve: bool = False  # there is a valve, at X_BV
     X_BV: np.ndarray = transform()
+    posture: np.ndarray = array(-1)  # lift and waist as measured [m, rad]
     turn_angle: float = 0.0  # positive opens [rad]
     start: np.ndarray = array(-1)  # both arms, left first [rad]
     goal: np.ndarray = array(-1)
@@ -472,6 +478,7 @@ class GraspPlan(Message):
     X_BG_left: np.ndarray = transform()  # grasps
     X_BG_right: np.ndarray = transform()
     q_standoff: np.ndarray = array(-1)  # both arms at the stand-offs before the grasps, left first [rad]
+    posture: np.ndarray = array(-1)  # lift and waist from which they are reached [m, rad]
     margin: float = 0.0  # least arm margin over the whole turn, 1 is comfortable
 
 

@@ -6,7 +6,7 @@
                         drive   to it, forwards or backwards, whichever keeps the marker better in view
                         align   to the stance's heading
                         line    straight in, steering onto the line through the stance
-                        settle  trim heading and distance, stand still, check
+                        settle  trim heading and distance, wait for the lift, stand still, check
                     A differential drive cannot step sideways: if it ends beside the stance, it backs off and goes
                     through all phases again.
     retreat         straight back; the arms are folded.
@@ -44,6 +44,7 @@ from valve_drake.perception.marker import Marker
 from valve_drake.task.modes import owned
 
 MODES = owned("base_approach")
+RAISED = 0.01  # lift and waist are at the stance's when they are off by less [m, rad]
 
 
 @dc.dataclass
@@ -124,6 +125,7 @@ class Memory:
     first_seen: np.ndarray | None = None  # marker's x, y when it was sure first, and the base's then [m]
     panel: MedianPlace = MedianPlace()  # a point of its plane, and the heading of the normal into it
     stance: MedianPlace = MedianPlace()
+    posture: np.ndarray = dc.field(default_factory=lambda: np.zeros(0))  # of the newest stance [m, rad]
     phase: str = "plan"
     direction: float = 1.0  # of driving to the pre-stance: 1 forwards, -1 backwards
     attempt: int = 0
@@ -272,7 +274,7 @@ def _fine(
     if estimate.found and estimate.time > m.panel.seen:
         m = changed(m, panel=m.panel.add(estimate.time, _panel(marker, estimate), config.sightings))
     if stance.found and stance.time > m.stance.seen:
-        m = changed(m, stance=m.stance.add(stance.time, stance.base, config.sightings))
+        m = changed(m, stance=m.stance.add(stance.time, stance.base, config.sightings), posture=stance.posture)
     if not (_sure(config, m.panel) and _sure(config, m.stance)):
         if time - m.since > config.stance_patience:
             return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
@@ -400,7 +402,8 @@ def _settle(
     """Trims heading and distance; succeeds when the base has been at rest within the tolerances."""
     turn = abs(at.psi) > config.heading_tolerance / 3
     shift = abs(at.s) > config.position_tolerance / 3
-    busy = turn or (shift and abs(at.e) < config.position_tolerance)
+    rises = _rises(m, state)
+    busy = rises or turn or (shift and abs(at.e) < config.position_tolerance)
     if busy or not _still(config, state):
         m = changed(m, quiet_since=time)
     elif time - m.quiet_since >= config.still_time:
@@ -411,6 +414,11 @@ def _settle(
     rate = _turn(config, -at.psi, dt) if turn else 0.0
     forward = _drive(config, -at.s, config.trim_speed, dt) if shift else 0.0
     return m, np.array([forward, rate])
+
+
+def _rises(m: Memory, state: RobotState) -> bool:
+    """Whether lift or waist is still on its way to the stance's."""
+    return len(m.posture) == len(state.posture) and bool(np.any(np.abs(m.posture - state.posture) > RAISED))
 
 
 # ---------------------------------------------------------------- retreat

@@ -211,19 +211,25 @@ class Stances:
         return best
 
     # ------------------------------------------------------------ where to stand
-    def begin(self, X_OV: np.ndarray, turn_angle: float) -> StanceSearch:
-        """A search for the stance from which the valve at X_OV can be turned."""
-        return StanceSearch(X_OV, turn_angle, self._places(X_OV))
+    def begin(self, X_OV: np.ndarray, turn_angle: float, posture: np.ndarray | None = None) -> StanceSearch:
+        """A search for the stance from which the valve at X_OV can be turned.
 
-    def _places(self, X_OV: np.ndarray) -> tuple[tuple[Place, ...], ...]:
-        """Square to the panel, from near to far; first with the lift at home, then at other heights of it."""
+        posture: of a stance that was found for nearly the same valve: kept while it serves, since lifts are slow.
+        """
+        return StanceSearch(X_OV, turn_angle, self._places(X_OV, posture))
+
+    def _places(self, X_OV: np.ndarray, posture: np.ndarray | None) -> tuple[tuple[Place, ...], ...]:
+        """Square to the panel, from near to far; first with the lift as given, then at home, then at other heights."""
         heading = float(np.arctan2(X_OV[1, 2], X_OV[0, 2]))  # of z_V, into the panel, on the floor
         forward = np.array([np.cos(heading), np.sin(heading)])
         axis_point = X_OV[:, 3] + self.marker.panel_depth * X_OV[:, 2]  # the stem at the panel
         c = self.config
         distances = np.arange(c.distance_min, c.distance_max + 1e-9, c.distance_step)
         bases = [np.array([*(axis_point[:2] - distance * forward), heading]) for distance in distances]
+        home = self.robot.posture.home
         groups = [tuple(Place(base) for base in bases)]
+        if posture is not None and np.max(np.abs(posture - home), initial=0.0) > 1e-3:
+            groups.insert(0, tuple(Place(base, posture) for base in bases))
         if raised := self._postures():
             groups.append(tuple(Place(base, posture) for posture in raised for base in bases))
         return tuple(groups)

@@ -18,7 +18,8 @@ There is no integrator on the turn: the rate is scaled down as the torque nears 
 turn yields as all other directions do, so a stuck valve stores no energy. The joints get positions only: feeding the
 admittance's velocity forward makes the loop oscillate.
 
-All vectors are in the base's frame B, which stands still while the hands are on the valve, as lift and waist do.
+All vectors are in the base's frame B, which stands still while the hands are on the valve. Lift and waist are held;
+the hands are where they are measured.
 """
 
 import copy
@@ -253,7 +254,7 @@ class HybridRotation:
             idle = memory if memory.activation < 0 else changed(memory, activation=-1, status=Status())
             return idle, Command(time=time)
         q = (state.left_arm, state.right_arm)
-        X = (self.robot.forward(LEFT, q[0]), self.robot.forward(RIGHT, q[1]))
+        X = (self.robot.forward(LEFT, q[0], state.posture), self.robot.forward(RIGHT, q[1], state.posture))
         m = self._sense(dt, memory, state, mode, X)
         if mode.mode in (Mode.REACH, Mode.SERVO):  # other blocks move the hands
             return changed(m, activation=-1, status=Status(), commanding=False), Command(time=time)
@@ -270,7 +271,7 @@ class HybridRotation:
         run = {Mode.GRASP: self._grasp, Mode.TURN: self._turn, Mode.RELEASE: self._release}[Mode(mode.mode)]
         m, V, gripper = run(time, dt, m, state, mode, chain)
         V = V if sound else np.zeros((2, 6))
-        m = self._move(dt, m, V, chain)
+        m = self._move(dt, m, V, chain, state.posture)
         m = changed(m, telemetry=self._telemetry(time, m, chain))
         command = Command(time=time, left_arm=m.q[0], right_arm=m.q[1], left_gripper=gripper, right_gripper=gripper)
         return m, command
@@ -474,7 +475,7 @@ class HybridRotation:
         if m.stage == "retreat":
             way = min(c.retreat, c.retreat_speed * (time - m.since))
             left, right = (standoff(m.start[k], self.view[side], way) for k, side in enumerate(SIDES))
-            m = self._command(m, (left, right))
+            m = self._command(m, (left, right), state.posture)
             if way >= c.retreat:
                 status = Status(time, m.activation, "succeeded", progress=1.0, value=m.turned)
                 m = changed(m, stage="away", status=status)
@@ -485,20 +486,20 @@ class HybridRotation:
         status = Status(time, m.activation, "failed", verdict, detail, value=m.turned)
         return changed(m, stage="failed", status=status)
 
-    def _move(self, dt: float, m: Memory, V: np.ndarray, chain: Chain) -> Memory:
+    def _move(self, dt: float, m: Memory, V: np.ndarray, chain: Chain, posture: np.ndarray) -> Memory:
         """Integrates the hands' twists (about the chain's centre) into commanded poses and joints."""
         X = []
         for k in range(2):
             w, v = V[k, :3], V[k, 3:]
             R, p = m.X[k][:, :3], m.X[k][:, 3]
             X.append(make(rotation(w * dt) @ R, p + dt * (v + cross(w, p - chain.c))))
-        return self._command(m, (X[0], X[1]))
+        return self._command(m, (X[0], X[1]), posture)
 
-    def _command(self, m: Memory, X: Pair) -> Memory:
+    def _command(self, m: Memory, X: Pair, posture: np.ndarray) -> Memory:
         """Commands the poses X; a hand keeps its command if its pose has no inverse near the present joints."""
         q, kept = list(m.q), list(m.X)
         for k, side in enumerate(SIDES):
-            solution = self.robot.inverse(side, X[k], m.q[k])
+            solution = self.robot.inverse(side, X[k], m.q[k], posture)
             if solution is not None and np.max(np.abs(solution - m.q[k])) < 0.5:
                 q[k], kept[k] = solution, X[k]
         return changed(m, X=(kept[0], kept[1]), q=(q[0], q[1]))

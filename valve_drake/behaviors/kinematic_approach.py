@@ -108,7 +108,7 @@ class Inputs(NamedTuple):
 
 # Modes in which another block moves the arms; on return the commands start from the measured joints.
 NOT_OWNED = tuple(mode for mode, row in TABLE.items() if row.hands != "kinematic_approach")
-OFF_HOME = 0.005  # of lift and waist while the hands work; it displaces them by as much a meter away [rad, m]
+STILL = 0.005  # lift and waist have not moved by more in the last second: they stand [rad, m]
 NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms [m]
 
 
@@ -145,7 +145,7 @@ class KinematicApproach:
         if mode.mode in run:
             m = run[Mode(mode.mode)](time, m, inputs)
         else:
-            m = self._homing(time, m, self._valve(m, state, turn) if m.phase == "start" else None, inputs.path)
+            m = self._homing(time, m, self._valve(m, state, turn) if m.phase == "start" else None, inputs)
         if m.path is not None:
             m = changed(m, q=m.path.sample(time))
         gripper = np.array([self.robot.opening, self.config.gripper_force])
@@ -167,14 +167,14 @@ class KinematicApproach:
         X_BV = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OV0, turn.angle))
         return X_BV if np.hypot(*X_BV[:2, 3]) < NEAR else None
 
-    def _homing(self, time: float, m: Memory, X_BV: np.ndarray | None, path: PathPlan) -> Memory:
+    def _homing(self, time: float, m: Memory, X_BV: np.ndarray | None, inputs: Inputs) -> Memory:
         """Brings the arms home along a free path, once per activation; m.path is the move, phase "home" on arrival.
 
         X_BV: of a valve to keep clear of; read in phase "start" alone.
         """
         if m.phase == "start":
-            m = self._move(time, m, self.home, X_BV)
-        m = self._follow(time, m, path)
+            m = self._move(time, m, self.home, X_BV, inputs.state.posture)
+        m = self._follow(time, m, inputs.path)
         if m.phase == "moving" and (m.path is None or time >= m.path.end()):
             m = changed(m, phase="home", since=time)
         return m
@@ -183,12 +183,14 @@ class KinematicApproach:
         request = PlanRequest(m.request.number + 1, kind, X_BV is not None, np.eye(3, 4) if X_BV is None else X_BV)
         return changed(m, request=dc.replace(request, **what))
 
-    def _move(self, time: float, m: Memory, goal: np.ndarray, X_BV: np.ndarray | None) -> Memory:
+    def _move(
+        self, time: float, m: Memory, goal: np.ndarray, X_BV: np.ndarray | None, posture: np.ndarray
+    ) -> Memory:
         """Asks for a path from the present command to `goal`: phase "planning"; "moving" if there is no way to go."""
         m = changed(m, path=None, since=time)
         if np.max(np.abs(goal - m.q)) < 1e-6:
             return changed(m, phase="moving")
-        return changed(self._ask(m, "path", X_BV, start=m.q, goal=goal), phase="planning")
+        return changed(self._ask(m, "path", X_BV, posture=posture, start=m.q, goal=goal), phase="planning")
 
     def _follow(self, time: float, m: Memory, answer: PathPlan) -> Memory:
         """Takes the path that was asked for: phase "moving", or "blocked" if there is none."""
@@ -220,16 +222,12 @@ class KinematicApproach:
         fused = fuse(m.looks)
         if not fused.found:
             return self._status(changed(m, phase="end"), time, "failed", Verdict.MARKER_LOST, fused.reason)
-        posture = self.robot.posture
-        off = np.abs(inputs.state.torso[: len(posture)] - posture.home)
-        if len(posture) and not np.max(off) <= OFF_HOME:
-            k = int(np.argmax(off))
-            stands = inputs.state.torso[k]
-            detail = f"{posture.names[k]} stands at {stands:.3f}, the arms reach from {posture.home[k]:.3f}"
-            return self._status(changed(m, phase="end"), time, "failed", Verdict.FAULT, detail)
+        past = inputs.state.history[:, 4:-2]
+        if past.size and not np.max(np.ptp(past, axis=0)) <= STILL:
+            return m  # lift or waist is on its way
         X_BV = compose(inverse(planar(*inputs.state.odometry[:3])), fused.X_OV)
         m = changed(m, phase="planning", X_OV0=fused.X_OV, covariance=fused.covariance)
-        return self._ask(m, "grasps", X_BV, turn_angle=inputs.mode.turn_angle)
+        return self._ask(m, "grasps", X_BV, posture=inputs.state.posture, turn_angle=inputs.mode.turn_angle)
 
     def _plan(self, time: float, m: Memory, grasps: GraspPlan) -> Memory:
         """Takes the grasps that were asked for."""
@@ -248,7 +246,7 @@ class KinematicApproach:
     def _reach(self, time: float, m: Memory, inputs: Inputs) -> Memory:
         if m.phase == "start":
             m = self._status(m, time, "running")
-            m = self._move(time, m, m.plan.q_standoff, m.plan.X_BV)
+            m = self._move(time, m, m.plan.q_standoff, m.plan.X_BV, m.plan.posture)
         if m.phase == "planning":
             m = self._follow(time, m, inputs.path)
             if m.phase == "blocked":
@@ -273,7 +271,7 @@ class KinematicApproach:
         if m.phase == "start":
             m = self._status(m, time, "running")
         if m.phase in ("start", "planning", "moving"):
-            m = self._homing(time, m, turned(m.plan.X_BV, inputs.turn.angle), inputs.path)
+            m = self._homing(time, m, turned(m.plan.X_BV, inputs.turn.angle), inputs)
             if m.phase == "blocked":
                 return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path home")
         if m.phase == "home":

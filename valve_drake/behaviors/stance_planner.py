@@ -104,7 +104,8 @@ class StancePlanner:
             m = changed(m, searched=m.looks[-1], begun=time)
             if not fused.found:
                 return m
-            m = changed(m, search=self.stances.begin(fused.X_OV, mode.turn_angle))
+            last = m.stance.posture if m.stance.found else None
+            m = changed(m, search=self.stances.begin(fused.X_OV, mode.turn_angle, last))
         assert m.search is not None
         search = self.stances.advance(m.search)
         if not search.done:
@@ -129,14 +130,16 @@ class StancePlanner:
         return m
 
     def _grasps(self, request: PlanRequest) -> GraspPlan:
-        arc = self.stances.best_arc(request.X_BV, request.turn_angle)
+        arc = self.stances.best_arc(request.X_BV, request.turn_angle, posture=request.posture)
         found = arc.margin >= self.stances.config.margin_min
         plan = GraspPlan(number=request.number, found=found, X_BV=request.X_BV, swapped=arc.swapped, margin=arc.margin)
         if not found:
             return plan
         X_BG = {side: compose(request.X_BV, hand_in_valve(side, arc.swapped, self.stances.marker)) for side in SIDES}
         q = np.concatenate([arc.q_standoff[side] for side in SIDES])
-        return dc.replace(plan, X_BG_left=X_BG[LEFT], X_BG_right=X_BG[RIGHT], q_standoff=q)
+        return dc.replace(
+            plan, X_BG_left=X_BG[LEFT], X_BG_right=X_BG[RIGHT], q_standoff=q, posture=request.posture
+        )
 
     def _path(self, m: Memory, request: PlanRequest) -> Memory:
         """One portion of the search for a path; where the straight line is blocked, the via poses are made."""
@@ -146,10 +149,11 @@ class StancePlanner:
         arms, split = self.robot.arms, self.robot.split
 
         def is_free(q: np.ndarray) -> bool:
-            return all(arms[side].within(part) for side, part in split(q).items()) and self.stances.is_free(X_BV, q)
+            within = all(arms[side].within(part) for side, part in split(q).items())
+            return within and self.stances.is_free(X_BV, q, request.posture)
 
         if search.portion == 1 and m.vias_left:
-            vias = tuple(self.vias(request.start, request.goal))
+            vias = tuple(self.vias(request.start, request.goal, request.posture))
             return changed(m, path_search=dc.replace(search, vias=vias), vias_left=False)
         search = search.advance(is_free)
         if not search.done:
@@ -158,16 +162,16 @@ class StancePlanner:
         path = PathPlan(number=request.number, found=search.points is not None, points=points)
         return changed(m, path_search=None, path=path)
 
-    def vias(self, start: np.ndarray, goal: np.ndarray) -> list[np.ndarray]:
+    def vias(self, start: np.ndarray, goal: np.ndarray, posture: np.ndarray) -> list[np.ndarray]:
         """Via poses: both hands drawn straight back from the end of the path at the valve; nearly always free."""
         at_valve = self.robot.split(start if np.allclose(goal, self.robot.home) else goal)
         out: list[np.ndarray] = []
         for back in BACK:
             arms = []
             for side in SIDES:
-                X_BG = standoff(self.robot.forward(side, at_valve[side]), np.array([0.0, 0, 1]), back)
+                X_BG = standoff(self.robot.forward(side, at_valve[side], posture), np.array([0.0, 0, 1]), back)
                 X_BG[1, 3] += OUTWARD[side] * back / 2
-                arms.append(self.robot.inverse(side, X_BG, at_valve[side]))
+                arms.append(self.robot.inverse(side, X_BG, at_valve[side], posture))
             reached = [q for q in arms if q is not None]
             if len(reached) == len(arms):
                 out.append(np.concatenate(reached))

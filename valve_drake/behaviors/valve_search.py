@@ -94,6 +94,7 @@ class Memory:
     torso: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # command [rad]
     velocity: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # of the command [rad/s]
     goal: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # of the previous step [rad]
+    lift: np.ndarray | None = None  # where it is sent, as a stance asked for last; None: home [m, rad]
     # the marker
     target: np.ndarray | None = None  # p_OV [m]
     target_time: float = -np.inf  # its capture time [s]
@@ -192,6 +193,7 @@ def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
         torso=m.torso,
         velocity=m.velocity,
         goal=m.goal,
+        lift=m.lift,
         target=m.target,
         target_time=m.target_time,
         capture_time=m.capture_time,

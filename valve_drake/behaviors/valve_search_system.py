@@ -5,7 +5,17 @@ import dataclasses as dc
 import numpy as np
 
 from valve_drake.behaviors.valve_search import HeadPose, Memory, ValveSearchConfig, step
-from valve_drake.messages import Command, ModeState, RectangleEstimate, RobotState, Status, StereoPosition
+from valve_drake.memory import changed
+from valve_drake.messages import (
+    Command,
+    Mode,
+    ModeState,
+    RectangleEstimate,
+    RobotState,
+    Stance,
+    Status,
+    StereoPosition,
+)
 from valve_drake.ports import TICK, Block, Inputs, Outputs
 
 
@@ -14,6 +24,7 @@ class ValveSearchInputs(Inputs):
     mode: ModeState
     position: StereoPosition = StereoPosition()
     estimate: RectangleEstimate = RectangleEstimate()
+    stance: Stance = Stance()
 
 
 class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
@@ -25,12 +36,13 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
     mode         in   ModeState
     position     in   StereoPosition     stage 1
     estimate     in   RectangleEstimate  stage 2
+    stance       in   Stance             lift to stand there with, by stance_planner
     command      out  Command            torso always, base_twist in search
     status       out  Status
 
     head_pose: base (x, y, heading) in O, torso (n,) -> X_OL (3, 4). rest: the torso's joints at home (n,). waist: which
     of them is the waist; None: the robot has none. The last two are tilt and pan. The gaze is that of waist (0 if there
-    is none), tilt and pan; what else the torso has stays at home.
+    is none), tilt and pan. The lift is driven to the stance's in fine_approach, and stays there.
     """
 
     OUTPUTS = {"command": Command, "status": Status}
@@ -47,13 +59,22 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         self.config = config if waist is not None else dc.replace(config, sweep_waist=0.0)
         self._rest, self._waist = rest, waist
         self._plain = waist == 0 and len(rest) == 3  # the torso is the gaze
-        self.head_pose = head_pose if self._plain else lambda base, gaze: head_pose(base, self._torso(gaze))
+        self._whole_pose = head_pose
         super().__init__(name, period=2 * TICK)
 
     def initial(self) -> Memory:
         return Memory()
 
     def step(self, time: float, inputs: ValveSearchInputs, memory: Memory) -> tuple[Memory, Outputs]:
+        stance = inputs.stance
+        if inputs.mode.mode == Mode.FINE_APPROACH and stance.found and len(stance.posture) == len(self._rest) - 2:
+            memory = changed(memory, lift=stance.posture)
+        lift = self._rest[:-2] if memory.lift is None else memory.lift
+        measured = inputs.robot_state.torso
+
+        def head_pose(base: np.ndarray, gaze: np.ndarray) -> np.ndarray:
+            return self._whole_pose(base, gaze if self._plain else self._torso(gaze, measured[:-2]))
+
         memory, command, status = step(
             self.config,
             memory,
@@ -63,10 +84,10 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
             inputs.mode,
             inputs.position,
             inputs.estimate,
-            self.head_pose,
+            head_pose,
         )
         if command.torso is not None and not self._plain:
-            command = dc.replace(command, torso=self._torso(command.torso))
+            command = dc.replace(command, torso=self._torso(command.torso, lift))
         return memory, {"command": command, "status": status}
 
     def _seen(self, state: RobotState) -> RobotState:
@@ -76,9 +97,10 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         waist = 0.0 if self._waist is None else state.torso[self._waist]
         return dc.replace(state, torso=np.array([waist, *state.torso[-2:]]))
 
-    def _torso(self, gaze: np.ndarray) -> np.ndarray:
-        """The torso's joints for waist, tilt and pan."""
+    def _torso(self, gaze: np.ndarray, posture: np.ndarray) -> np.ndarray:
+        """The torso's joints for waist, tilt and pan; posture: lift and waist, of which the lift counts."""
         torso = self._rest.copy()
+        torso[: len(posture)] = posture
         torso[-2:] = gaze[1:]
         if self._waist is not None:
             torso[self._waist] = gaze[0]

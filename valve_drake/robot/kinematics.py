@@ -74,7 +74,8 @@ class HandLoad:
 class RobotKinematics(Protocol):
     """What the behaviours know of a robot. Every answer depends on the question alone.
 
-    q: an arm's joints (n,). posture: lift and waist, in the order of `posture.names`; None: where they are at home.
+    q: an arm's joints (n,). posture: lift and waist, in the order of `posture.names`; None or empty: where they are at
+    home.
     """
 
     @property

@@ -44,20 +44,29 @@ _TOUCH = 1e-4  # an opening may lack so much of what is asked for [m]
 
 @dc.dataclass(frozen=True, eq=False)
 class Gripper:
-    """A gripper: its joint's positions and the openings between its pads there, both rising or the first falling."""
+    """A gripper: its joint's positions and the openings between its pads there.
+
+    Forces are those of an actuator that moves one pad along the other's line, and the other pad by a gear: on each pad
+    is half of it. Its travel is half the opening, so the joint's effort is force times `lever`.
+    """
 
     joint: str
-    positions: np.ndarray  # (K,) [rad or m]
-    openings: np.ndarray  # (K,) rising [m]
+    positions: np.ndarray  # (K,) rising [rad or m]
+    openings: np.ndarray  # (K,) rising or falling [m]
+    levers: np.ndarray  # (K,) half the opening's change over the joint's, positive or negative [m/rad or 1]
 
     def opening(self, position: float) -> float:
         """Between the pads [m]."""
-        order = slice(None) if self.positions[0] < self.positions[-1] else slice(None, None, -1)
-        return float(np.interp(position, self.positions[order], self.openings[order]))
+        return float(np.interp(position, self.positions, self.openings))
 
     def position(self, opening: float) -> float:
         """Of the joint [rad or m]."""
-        return float(np.interp(opening, self.openings, self.positions))
+        rising = slice(None) if self.openings[0] < self.openings[-1] else slice(None, None, -1)
+        return float(np.interp(opening, self.openings[rising], self.positions[rising]))
+
+    def lever(self, position: float) -> float:
+        """The joint's effort for a force that opens [m or 1]."""
+        return float(np.interp(position, self.positions, self.levers))
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -212,7 +221,7 @@ class Robot:
         return {LEFT: q[:n], RIGHT: q[n:]}
 
     def forward(self, side: str, q: np.ndarray, posture: np.ndarray | None = None) -> np.ndarray:
-        """X_BG of a hand for its arm's joints (n,) -> (3, 4). posture: lift and waist; None: at home."""
+        """X_BG of a hand for its arm's joints (n,) -> (3, 4). posture: lift and waist; None or empty: at home."""
         chain = self._chains[side]
         self._set(chain, q, posture)
         return self._pose(chain.grip)
@@ -295,7 +304,7 @@ class Robot:
         scratch = self._scratch
         scratch[:] = self._home_q
         scratch[chain.q] = q
-        if posture is not None:
+        if posture is not None and len(posture):
             scratch[self._posture_q] = posture
         self._plant.SetPositions(self._context, scratch)
 
@@ -381,13 +390,13 @@ class Robot:
             distances.append(points[0] - points[1])
         openings = np.array(distances)
         openings *= 1.0 if abs(openings.max()) >= abs(openings.min()) else -1.0
-        if openings[0] > openings[-1]:
-            positions, openings = positions[::-1], openings[::-1]
-        if not np.all(np.diff(openings) > 0):
+        rising = 1.0 if openings[0] < openings[-1] else -1.0
+        if not np.all(rising * np.diff(openings) > 0):
             raise ConfigError(f"{key}.joint must open and shut the pads, got {shown(joint.name())}")
-        most, wanted = float(openings[-1]), self.description.opening
+        most, wanted = float(openings.max()), self.description.opening
         require(wanted <= most + _TOUCH, "opening", f"at most {most:.4g} m, which the {side} gripper opens", wanted)
-        return Gripper(joint.name(), _locked(positions), _locked(openings))
+        levers = np.gradient(openings, positions) / 2
+        return Gripper(joint.name(), _locked(positions), _locked(openings), _locked(levers), (surface[0], surface[1]))
 
     def _hand(self, side: str) -> HandLoad:
         """Mass and centre of mass of all bodies beyond the sensor, grippers open, in the sensor's frame."""

@@ -27,17 +27,15 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from valve_drake import profiling
 from valve_drake.beside import Beside
-from valve_drake.checks import require
 from valve_drake.messages import SIDES
 from valve_drake.ports import SLOT, TICK, PythonSystem
 from valve_drake.robot.groups import GROUPS
-from valve_drake.robot.robot import Gripper, Robot
+from valve_drake.robot.robot import Robot
 from valve_drake.stations.contract import CONTRACT, vectors
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.servos import add_servos, ignore_touching
 from valve_drake.stations.simulation_config import ValveConfig
 
-STRAIGHT = 2e-4  # an opening may leave the straight line over its joint by so much [m]
 STEPS = 2  # of the plant in a tick; twice as many leave forces and angles as they are and double the work
 COMMANDS = tuple(spec.name for spec in CONTRACT if spec.direction == "in")
 STEM = "stem"  # the valve's joint, and the output port of its load
@@ -56,6 +54,8 @@ class PlantSystem(PythonSystem):
     actuation                        out  vector     of the robot's actuators in the last step, by index [N m, N]
     left, right, stem                out  vector(6)  [torque; force] of the joint on its child in the last step, in
                                                      the child's frame: the wrist sensors and the valve's stem
+    left_opening, right_opening      out  vector(1)  between the pads [m]
+    left_grip, right_grip            out  vector(1)  force of the finger actuator that closes, in the last step [N]
 
     Slot 2 of tick k finds the commands of tick k - 1 at its ports, since command_selector replaces them at the same
     instant, and makes the state of t_(k+1) from that of t_k. So a command of tick k moves the joints from t_(k+1) on,
@@ -125,7 +125,7 @@ class PlantSystem(PythonSystem):
         self._base_at = [order.index(name) for name in self.base]
         self._fingers = [(order.index(name), joints[order.index(name)].position_start()) for name in fingers]
         self._actuated_at = [joint.velocity_start() for joint in joints]
-        self.opening = {side: _opening(robot.grippers[side], side) for side in SIDES}
+        self._grippers = [robot.grippers[side] for side in SIDES]
         gains = [self.plant.GetJointActuatorByName(name, self.robot).get_controller_gains() for name in fingers]
         self._stiffness = [gain.p for gain in gains]
 
@@ -147,12 +147,16 @@ class PlantSystem(PythonSystem):
         self._actuation = self.DeclareDiscreteState(len(self.actuated))  # of the robot's actuators, in the last step
         self._load = [self.DeclareDiscreteState(6) for _ in loaded]  # [torque; force], in the last step
         nx = self.plant.num_multibody_states()
-        self._parts = [nx, len(self.base), len(self.actuated), *(6 for _ in loaded)]  # sizes of what a tick makes
+        still = self._measured_grips(self.plant.GetPositionsAndVelocities(self._inner), np.zeros(len(joints)))
+        self._grip = [self.DeclareDiscreteState([value]) for value in still]
+        self._parts = [nx, len(self.base), len(self.actuated), *(6 for _ in loaded), *(1 for _ in still)]  # sizes of what a tick makes
         self._ends = list(itertools.accumulate([nx, len(self.base), *sizes.values()]))  # in what it is made of
         self._beside: Beside | None = None
         self.DeclareStateOutputPort("state", self._x)
         self.DeclareStateOutputPort("actuation", self._actuation)
         for name, index in zip(loaded, self._load):
+            self.DeclareStateOutputPort(name, index)
+        for name, index in zip((f"{side}_{what}" for side in SIDES for what in ("opening", "grip")), self._grip):
             self.DeclareStateOutputPort(name, index)
         self.DeclarePeriodicUnrestrictedUpdateEvent(TICK, 2 * SLOT, self._update)
         self.DeclarePeriodicPublishEvent(TICK, 3 * SLOT, self._begin)
@@ -171,7 +175,7 @@ class PlantSystem(PythonSystem):
         commands, desired = self._commands(context), np.zeros(len(self._desired))
         self._set_joints(desired, commands)
         self._set_base(desired, tuple(base.tolist()), tuple(commands["base.twist_command"].tolist()), 0.0)
-        self._set_fingers(desired, x, self._grips(commands))
+        self._set_fingers(desired, x, self._grips(x, commands))
         self.diagram.GetInputPort("desired").FixValue(inner, desired)
         self.diagram.GetInputPort("feed_forward").FixValue(inner, self._gravity(plant_context))
         return plant_context
@@ -185,18 +189,25 @@ class PlantSystem(PythonSystem):
         """What the robot's actuators do to bear its weight (n,) [N m, N]."""
         return -self.plant.CalcGravityGeneralizedForces(plant_context)[self._actuated_at]
 
-    def _grips(self, commands: dict[str, np.ndarray]) -> list[tuple[float, float]]:
+    def _grips(self, x: np.ndarray, commands: dict[str, np.ndarray]) -> list[tuple[float, float]]:
         """Of each hand: where its finger is sent, how far from where it is the servo may pull it [rad or m].
 
-        A force limit is that on the finger: the joint's effort times the joint's way over half the opening's.
+        x: of the plant, now. A force limit is that of the finger actuator; the joint's effort follows by the lever.
         """
         out = []
-        for side, stiffness in zip(SIDES, self._stiffness):
-            slope, zero = self.opening[side]
+        for side, gripper, (_, at), stiffness in zip(SIDES, self._grippers, self._fingers, self._stiffness):
             opening = float(commands[f"{side}_gripper.position_command"][0])
-            effort = float(commands[f"{side}_gripper.force_limit"][0]) * abs(slope) / 2
-            out.append(((opening - zero) / slope, effort / stiffness))
+            effort = float(commands[f"{side}_gripper.force_limit"][0]) * abs(gripper.lever(float(x[at])))
+            out.append((gripper.position(opening), effort / stiffness))
         return out
+
+    def _measured_grips(self, x: np.ndarray, actuation: np.ndarray) -> np.ndarray:
+        """Of each hand: opening [m], force of the finger actuator that closes [N] -> (4,)."""
+        out: list[float] = []
+        for gripper, (actuated, at) in zip(self._grippers, self._fingers):
+            q = float(x[at])
+            out += [gripper.opening(q), -float(actuation[actuated]) / gripper.lever(q)]
+        return np.array(out)
 
     def _commands(self, context: Context) -> dict[str, np.ndarray]:
         return {name: port.Eval(context) for name, port in self._inputs.items()}
@@ -249,12 +260,12 @@ class PlantSystem(PythonSystem):
             answer = self._advance(question) if self._beside is None else self._beside.answer(question)
         values = state.get_mutable_discrete_state()
         start = 0
-        for index, size in zip((self._x, self._base, self._actuation, *self._load), self._parts):
+        for index, size in zip((self._x, self._base, self._actuation, *self._load, *self._grip), self._parts):
             values.set_value(index, answer[start : start + size])
             start += size
 
     def _advance(self, question: np.ndarray) -> np.ndarray:
-        """One tick. It depends on the question alone -> x, the base's set point, actuation and loads ."""
+        """One tick. It depends on the question alone -> x, the base's set point, actuation, loads, grips."""
         x, base, *commands = (question[a:b] for a, b in itertools.pairwise((0, *self._ends)))
         with self._lock:
             return np.concatenate(self._step(x, base, dict(zip(self._inputs, commands))))
@@ -263,7 +274,7 @@ class PlantSystem(PythonSystem):
         scratch, desired = self._scratch, self._desired
         start: _Pose = tuple(base.tolist())
         twist: tuple[float, float] = tuple(commands["base.twist_command"].tolist())
-        grips = self._grips(commands)
+        grips = self._grips(x, commands)
         scratch.SetDiscreteState(x)
         self._fixed_feed_forward.GetMutableData()  # tells the Context that the memory of `_feed_forward` changes
         self._feed_forward[:] = self._gravity(self._inner)
@@ -281,16 +292,7 @@ class PlantSystem(PythonSystem):
         actuation = self._net_actuation.Eval(self._inner)
         forces = self._reaction_forces.Eval(self._inner)
         loads = [forces[k].get_coeffs() for k in self._loads]
-        return x, np.array(_driven(start, twist, TICK)), actuation, *loads
-
-
-def _opening(gripper: Gripper, side: str) -> tuple[float, float]:
-    """Slope and zero of the opening over the joint's position. Raises ConfigError for a gripper that is not linear."""
-    slope, zero = np.polyfit(gripper.positions, gripper.openings, 1)
-    off = float(np.abs(gripper.positions * slope + zero - gripper.openings).max())
-    words = f"one that opens in proportion, within {STRAIGHT} m"
-    require(off < STRAIGHT, f"grippers.{side}.joint", words, f"{off:.4f} m")
-    return float(slope), float(zero)
+        return x, np.array(_driven(start, twist, TICK)), actuation, *loads, self._measured_grips(x, actuation)
 
 
 def _driven(base: _Pose, twist: tuple[float, float], time: float) -> _Pose:

@@ -10,6 +10,7 @@ from valve_drake.perception.marker import Marker
 from valve_drake.robot.robot import Robot
 
 FULL = 0.03  # a servo without gains in the file gives its full effort this far off; raise it if it shakes [rad, m]
+GRIP_STIFFNESS, GRIP_DAMPING = 2e4, 2e2  # of such a gripper's actuator, along half the opening [N/m, N s/m]
 DAMPING = 0.03  # of such a servo, as a share of its stiffness; raise it if it swings [s]
 
 
@@ -23,6 +24,7 @@ def add_servos(plant: MultibodyPlant, model: ModelInstanceIndex, robot: Robot) -
         for side in SIDES
         for joint, stiffness in zip(robot.arms[side].names, robot.description.arm(side).stiffness)
     }
+    grippers = {gripper.joint: gripper for gripper in robot.grippers.values()}
     for index in plant.GetJointActuatorIndices():
         actuator = plant.get_joint_actuator(index)
         if actuator.model_instance() != model:
@@ -30,8 +32,14 @@ def add_servos(plant: MultibodyPlant, model: ModelInstanceIndex, robot: Robot) -
         stiffness = wanted.get(actuator.joint().name())
         if stiffness is None and actuator.has_controller():
             continue
-        stiffness = actuator.effort_limit() / FULL if stiffness is None else stiffness
-        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=DAMPING * stiffness))
+        gripper = grippers.get(actuator.joint().name())
+        if gripper is not None:
+            lever = gripper.lever(gripper.position(robot.opening / 2))
+            gains = PdControllerGains(p=GRIP_STIFFNESS * lever**2, d=GRIP_DAMPING * lever**2)
+        else:
+            stiffness = actuator.effort_limit() / FULL if stiffness is None else stiffness
+            gains = PdControllerGains(p=stiffness, d=DAMPING * stiffness)
+        actuator.set_controller_gains(gains)
 
 
 def ignore_touching(plant: MultibodyPlant, scene_graph: SceneGraph, model: ModelInstanceIndex, robot: Robot) -> None:

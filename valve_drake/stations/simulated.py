@@ -304,10 +304,8 @@ def make_simulated_station(
     for name in COMMANDS:
         builder.ExportInput(physics.GetInputPort(name), name)
 
-    def measure(
-        port: str, joints: Sequence[str], what: str, factor: float = 1.0, offset: np.ndarray | None = None
-    ) -> None:
-        matrix = factor * _select(physics, joints, what)
+    def measure(port: str, joints: Sequence[str], what: str, offset: np.ndarray | None = None) -> None:
+        matrix = _select(physics, joints, what)
         gain = builder.AddSystem(MatrixGain(matrix) if offset is None else _affine(matrix, offset))
         gain.set_name(port)
         builder.Connect(physics.GetOutputPort("actuation") if what == "torque" else state, gain.get_input_port())
@@ -319,10 +317,8 @@ def make_simulated_station(
         measure(f"{side}_arm.position_measured", joints, "position", offset=offsets[side])
         measure(f"{side}_arm.velocity_measured", joints, "velocity")
         measure(f"{side}_arm.torque_measured", joints, "torque")
-        slope, zero = physics.opening[side]
-        finger = [robot.grippers[side].joint]
-        measure(f"{side}_gripper.position_measured", finger, "position", slope, np.array([zero]))
-        measure(f"{side}_gripper.force_measured", finger, "torque", -2.0 / slope)
+        builder.ExportOutput(physics.GetOutputPort(f"{side}_opening"), f"{side}_gripper.position_measured")
+        builder.ExportOutput(physics.GetOutputPort(f"{side}_grip"), f"{side}_gripper.force_measured")
 
     moves = np.vstack([_select(physics, robot.base.names, what) for what in ("position", "velocity")])
     moving = builder.AddNamedSystem("base_state", MatrixGain(moves))
