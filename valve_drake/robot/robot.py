@@ -396,7 +396,7 @@ class Robot:
         most, wanted = float(openings.max()), self.description.opening
         require(wanted <= most + _TOUCH, "opening", f"at most {most:.4g} m, which the {side} gripper opens", wanted)
         levers = np.gradient(openings, positions) / 2
-        return Gripper(joint.name(), _locked(positions), _locked(openings), _locked(levers), (surface[0], surface[1]))
+        return Gripper(joint.name(), _locked(positions), _locked(openings), _locked(levers))
 
     def _hand(self, side: str) -> HandLoad:
         """Mass and centre of mass of all bodies beyond the sensor, grippers open, in the sensor's frame."""

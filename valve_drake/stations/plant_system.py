@@ -141,7 +141,8 @@ class PlantSystem(PythonSystem):
         self._net_actuation = self.plant.get_net_actuation_output_port(self.robot)
         self._reaction_forces = self.plant.get_reaction_forces_output_port()
         loaded = {side: robot.description.arm(side).sensor for side in SIDES} | {STEM: STEM}  # output port -> joint
-        self._loads = [self.plant.GetJointByName(name).index() for name in loaded.values()]
+        present = list(self.plant.GetJointIndices())  # a welded joint has left its index unused
+        self._loads = [present.index(self.plant.GetJointByName(name).index()) for name in loaded.values()]
         self._x = self.DeclareDiscreteState(self.plant.GetPositionsAndVelocities(self._inner))
         self._base = self.DeclareDiscreteState([start[name] for name in self.base])
         self._actuation = self.DeclareDiscreteState(len(self.actuated))  # of the robot's actuators, in the last step
