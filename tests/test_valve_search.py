@@ -377,6 +377,7 @@ def test_ports():
         "mode": "in abstract",
         "position": "in abstract",
         "estimate": "in abstract",
+        "stance": "in abstract",
         "command": "out abstract",
         "status": "out abstract",
     }

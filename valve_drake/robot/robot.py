@@ -56,13 +56,19 @@ class Gripper:
     levers: np.ndarray  # (K,) half the opening's change over the joint's, positive or negative [m/rad or 1]
 
     def opening(self, position: float) -> float:
-        """Between the pads [m]."""
-        return float(np.interp(position, self.positions, self.openings))
+        """Between the pads; beyond the joint's ends it goes on as there [m]."""
+        within = float(np.interp(position, self.positions, self.openings))
+        low, high = float(self.positions[0]), float(self.positions[-1])
+        beyond = position - min(max(position, low), high)
+        return within + 2 * self.lever(position) * beyond if beyond else within
 
     def position(self, opening: float) -> float:
-        """Of the joint [rad or m]."""
+        """Of the joint; beyond the ends of the opening it goes on as there: a shut gripper presses [rad or m]."""
         rising = slice(None) if self.openings[0] < self.openings[-1] else slice(None, None, -1)
-        return float(np.interp(opening, self.openings[rising], self.positions[rising]))
+        openings, positions = self.openings[rising], self.positions[rising]
+        within = float(np.interp(opening, openings, positions))
+        beyond = opening - min(max(opening, float(openings[0])), float(openings[-1]))
+        return within + beyond / (2 * self.lever(within)) if beyond else within
 
     def lever(self, position: float) -> float:
         """The joint's effort for a force that opens [m or 1]."""
