@@ -183,9 +183,7 @@ class KinematicApproach:
         request = PlanRequest(m.request.number + 1, kind, X_BV is not None, np.eye(3, 4) if X_BV is None else X_BV)
         return changed(m, request=dc.replace(request, **what))
 
-    def _move(
-        self, time: float, m: Memory, goal: np.ndarray, X_BV: np.ndarray | None, posture: np.ndarray
-    ) -> Memory:
+    def _move(self, time: float, m: Memory, goal: np.ndarray, X_BV: np.ndarray | None, posture: np.ndarray) -> Memory:
         """Asks for a path from the present command to `goal`: phase "planning"; "moving" if there is no way to go."""
         m = changed(m, path=None, since=time)
         if np.max(np.abs(goal - m.q)) < 1e-6:

@@ -137,9 +137,7 @@ class StancePlanner:
             return plan
         X_BG = {side: compose(request.X_BV, hand_in_valve(side, arc.swapped, self.stances.marker)) for side in SIDES}
         q = np.concatenate([arc.q_standoff[side] for side in SIDES])
-        return dc.replace(
-            plan, X_BG_left=X_BG[LEFT], X_BG_right=X_BG[RIGHT], q_standoff=q, posture=request.posture
-        )
+        return dc.replace(plan, X_BG_left=X_BG[LEFT], X_BG_right=X_BG[RIGHT], q_standoff=q, posture=request.posture)
 
     def _path(self, m: Memory, request: PlanRequest) -> Memory:
         """One portion of the search for a path; where the straight line is blocked, the via poses are made."""
