@@ -192,3 +192,14 @@ def test_handles_are_shared_the_better_way():
 def test_bad_config_is_refused_by_name(changes):
     with pytest.raises(ConfigError, match=f"stance.{next(iter(changes))}"):
         StanceConfig(**changes).check()
+
+
+def test_arms_that_touch_something_where_they_draw_back_have_no_stance():
+    X_OV = valve_at(1.0)
+    base, _ = stance(X_OV, 90, distance_min=0.76, distance_max=0.78)
+    X_BV = compose(inverse(planar(*base)), X_OV)
+    arc = stances().best_arc(X_BV, np.pi / 2)
+    back = np.concatenate([arc.q_standoff[side] for side in SIDES])
+    blocked = stances(lambda X_BV, q, posture=None: not np.allclose(q, back))
+    assert arc.margin > 0.5
+    assert blocked.check_arc(X_BV, np.pi / 2, arc.swapped).margin == -1

@@ -147,14 +147,14 @@ class Stances:
 
         X_BV: marker in the base. near: joints of a like arc's start, by side. posture: lift and waist; None: at home.
         least: the check ends where the margin falls to it: whoever asks knows a better arc.
-        Unless the arms are free of all at the turn's start, middle and end, the margin is -1.
+        Unless the arms are free of all at the turn's start, middle and end, and drawn back, the margin is -1.
         """
         robot, out = self.robot, ArcCheck(-1.0, swapped)
         count = max(2, int(np.ceil(abs(turn_angle) / self.config.arc_step)) + 1)
         angles = np.linspace(0.0, turn_angle, count)
         margin = 1.0
         arcs: dict[str, list[np.ndarray]] = {side: [] for side in SIDES}
-        q_standoff: dict[str, np.ndarray] = {}
+        backs: dict[str, list[np.ndarray]] = {side: [] for side in SIDES}
         for side in SIDES:
             X_VG = hand_in_valve(side, swapped, self.marker)
             q_last = near.get(side) if near else None
@@ -172,16 +172,20 @@ class Stances:
                     if back is None:
                         return out
                     margin = min(margin, robot.margin(side, back))
-                    q_standoff.setdefault(side, back)
+                    backs[side].append(back)
                 if margin <= least:
                     return ArcCheck(margin, swapped)
                 arcs[side].append(q)
                 q_last = q
-        for k in (0, count // 2, count - 1):
-            q_both = np.concatenate([arcs[side][k] for side in SIDES])
-            if not self.is_free(turned(X_BV, angles[k]), q_both, posture):
+        poses = [(angles[k], arcs, k) for k in (0, count // 2, count - 1)]
+        poses += [(angles[0], backs, 0), (angles[-1], backs, 1)]
+        for angle, joints, k in poses:
+            q_both = np.concatenate([joints[side][k] for side in SIDES])
+            if not self.is_free(turned(X_BV, angle), q_both, posture):
                 return out
-        return ArcCheck(margin, swapped, {side: arcs[side][0] for side in SIDES}, q_standoff)
+        return ArcCheck(
+            margin, swapped, {side: arcs[side][0] for side in SIDES}, {side: backs[side][0] for side in SIDES}
+        )
 
     def best_arc(
         self,
