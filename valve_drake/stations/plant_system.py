@@ -150,7 +150,8 @@ class PlantSystem(PythonSystem):
         nx = self.plant.num_multibody_states()
         still = self._measured_grips(self.plant.GetPositionsAndVelocities(self._inner), np.zeros(len(joints)))
         self._grip = [self.DeclareDiscreteState([value]) for value in still]
-        self._parts = [nx, len(self.base), len(self.actuated), *(6 for _ in loaded), *(1 for _ in still)]  # sizes of what a tick makes
+        wrenches, numbers = [6] * len(loaded), [1] * len(still)
+        self._parts = [nx, len(self.base), len(self.actuated), *wrenches, *numbers]  # sizes of what a tick makes
         self._ends = list(itertools.accumulate([nx, len(self.base), *sizes.values()]))  # in what it is made of
         self._beside: Beside | None = None
         self.DeclareStateOutputPort("state", self._x)
