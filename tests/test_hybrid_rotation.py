@@ -286,6 +286,29 @@ def test_the_turn_is_counted_from_where_it_began():
 # ---------------------------------------------------------------- what ends it
 
 
+def test_a_held_turn_slows_down_to_rest_keeps_the_grasp_and_goes_on_where_it_stopped():
+    bench = grasped()
+    bench.activation += 1
+    modes = [
+        ModeState(mode="turn", activation=bench.activation, turn_angle=0.8, held=held) for held in (False, True, False)
+    ]
+    for _ in range(int(3.0 / TICK)):
+        bench.tick(modes[0])
+    begun, rates, forces = bench.angle, [bench.memory.rate], []
+    for _ in range(int(20.0 / TICK)):
+        assert bench.tick(modes[1]).state == "running"
+        rates.append(bench.memory.rate)
+        forces.append(np.linalg.norm(bench.load[:, 3:], axis=1).max())
+    assert np.min(np.diff(rates)) >= -CONFIG.rate / CONFIG.ramp * TICK - 1e-9 and rates[-1] == 0.0
+    assert 0 <= bench.angle - begun < np.radians(2.5)
+    assert max(forces) < 30.0 and bench.gripper == [MARKER.handle_width] * 2
+    for _ in range(int(30.0 / TICK)):
+        status = bench.tick(modes[2])
+        if status.state != "running":
+            break
+    assert status.state == "succeeded" and bench.angle == pytest.approx(0.8, abs=np.radians(1.0))
+
+
 @pytest.mark.parametrize("spin", [1.0, 100.0])
 def test_a_seized_valve_is_stuck_without_wind_up(spin):
     bench = grasped(1e4, spin=spin)

@@ -10,6 +10,7 @@ from valve_drake.checks import ConfigError
 from valve_drake.messages import Cause, Health, Mode, ModeState, OperatorCommand, SelectorReport, Status, Verdict
 from valve_drake.supervisor.supervisor import (
     FAILURES,
+    HOLDS,
     State,
     SupervisorConfig,
     deadline,
@@ -521,6 +522,85 @@ def test_ages_are_judged_by_device():
         assert fault(camera, 0.9) == "" and fault(camera, 1.1)
     assert find_fault(CONFIG, 5.0, None, None)
     assert find_fault(CONFIG, 5.0, Health(time=5.0), SelectorReport(time=4.0)) == "no report from command_selector"
+
+
+# ---------------------------------------------------------------- held by the operator
+
+
+def ask(bench: Bench, command: str) -> None:
+    bench.operator = OperatorCommand(sequence=bench.operator.sequence + 1, command=command)
+    bench.tick()
+
+
+def test_grasp_and_turn_can_be_held_and_nothing_else():
+    assert HOLDS == (Mode.GRASP, Mode.TURN)
+    for mode in (*RUNNING, *TERMINAL, Mode.IDLE):
+        bench = bring_to(mode)
+        before = bench.state.activation
+        ask(bench, "hold")
+        assert bench.state.held == bench.state.message(bench.time, CONFIG).held == (mode in HOLDS)
+        assert (bench.state.mode, bench.state.activation) == (mode, before)
+
+
+def test_a_held_grasp_goes_on_to_a_held_turn_and_a_held_turn_can_succeed_fail_or_be_stopped():
+    bench = bring_to(Mode.GRASP)
+    ask(bench, "hold")
+    bench.tick(succeed)
+    assert (bench.state.mode, bench.state.held) == (Mode.TURN, True)
+    for script in (succeed, fail_in(Mode.TURN, Verdict.SLIP)):
+        bench = bring_to(Mode.TURN)
+        ask(bench, "hold")
+        bench.tick(script)
+        assert (bench.state.mode, bench.state.held) == (Mode.RELEASE, False)
+    bench = bring_to(Mode.TURN)
+    ask(bench, "hold")
+    ask(bench, "stop")
+    assert (bench.state.mode, bench.state.held, bench.state.after_release) == (Mode.RELEASE, False, Mode.STOPPED)
+
+
+def test_a_fault_ends_a_held_turn():
+    bench = bring_to(Mode.TURN)
+    ask(bench, "hold")
+    bench.health = {"faults": ("left_arm: hot",)}
+    assert bench.tick().mode == Mode.RELEASE
+
+
+def test_no_deadline_runs_while_the_turn_is_held_and_all_do_afterwards():
+    bench = bring_to(Mode.TURN)
+    begun, bound = bench.time, deadline(CONFIG, bench.state)
+    for _ in range(2):
+        ask(bench, "hold")
+        bench.time += CONFIG.hold_time - 1.0
+        assert bench.tick().mode == Mode.TURN
+        ask(bench, "resume")
+    while bench.state.mode == Mode.TURN:
+        bench.tick()
+    held = 2 * (CONFIG.hold_time - 1.0)
+    assert bench.time - begun - held == pytest.approx(bound, abs=8 * DT)
+    assert bench.state.verdict == Verdict.TIMEOUT
+
+
+def test_the_runs_deadline_does_not_run_while_the_turn_is_held():
+    bench = bring_to(Mode.TURN)
+    began = bench.state.began
+    ask(bench, "hold")
+    bench.time += 50.0
+    ask(bench, "resume")
+    assert bench.state.began - began == pytest.approx(50.0, abs=3 * DT)
+    bench = bring_to(Mode.TURN)
+    ask(bench, "hold")
+    bench.time += 50.0
+    bench.tick(succeed)
+    assert bench.state.began - began == pytest.approx(50.0, abs=3 * DT)
+
+
+def test_a_turn_that_is_held_for_too_long_is_stopped():
+    bench = bring_to(Mode.TURN)
+    ask(bench, "hold")
+    bench.time += CONFIG.hold_time + 0.1
+    state = bench.tick()
+    assert (state.mode, state.verdict, state.after_release) == (Mode.RELEASE, Verdict.STOPPED, Mode.STOPPED)
+    assert "held for more than" in state.reason
 
 
 # ---------------------------------------------------------------- block

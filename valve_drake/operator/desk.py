@@ -65,27 +65,28 @@ class Desk:
         self._answers = self._program = 0
         self._asked_to_leave = False
         self._sounds = 0
+        self._begin: float | None = None  # of the first sample [s]
         self._level = 0.0
 
     # ------------------------------------------------------------ what is said
     def say(self, heard: Heard) -> None:
-        """Words, by key, script or ear; those that are not believed stay here, but are shown."""
+        """Words, by key, script or ear. Those that are not believed are said too: the robot ignores and logs them."""
         score = "" if heard.typed else f" ({heard.score:.2f})"
-        if not heard.score >= SURE:
-            self._add("you", f"not clear: {heard.text}{score}")
-            return
-        self._add("you", heard.text + score)
+        unclear = "" if heard.score >= SURE else "not clear: "
+        self._add("you", f"{unclear}{heard.text}{score}")
         self.link.say(heard)
 
-    def sound(self, samples: np.ndarray, time: float | None = None) -> None:
+    def sound(self, samples: np.ndarray) -> None:
         """A piece of sound (n,) int16 at RATE that was heard just now."""
-        now = self._clock() if time is None else time
+        begin = self._clock() - len(samples) / RATE
+        if self._begin is None:
+            self._begin = begin
         self._level = float(np.sqrt(np.mean((samples / 2**15) ** 2))) if len(samples) else 0.0
         if self._send_sound:
-            self.link.sound(Sound(max(now - len(samples) / RATE, 0.0), self._sounds, RATE, samples))
+            self.link.sound(Sound(max(begin, 0.0), self._sounds, RATE, samples))
             self._sounds += len(samples)
-        for heard in self._ear.feed(samples) if self._ear else ():
-            self.say(heard)
+        for heard in self._ear.push(samples) if self._ear else ():
+            self.say(dc.replace(heard, begin=self._begin + heard.begin, end=self._begin + heard.end))
 
     def press(self, key: str) -> None:
         """One key."""

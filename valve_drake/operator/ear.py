@@ -19,9 +19,9 @@ SECONDS = 600  # of sound that may wait
 
 
 class Recogniser(Protocol):
-    """Makes words of a stream of sound: valve_drake.voice."""
+    """Makes words of a stream of sound: valve_drake.voice.recogniser."""
 
-    def feed(self, samples: np.ndarray) -> list[Heard]:
+    def push(self, samples: np.ndarray) -> list[Heard]:
         """Takes in the next samples (n,) int16 at RATE -> the utterances that they complete, in order.
 
         What is not believed comes too, with a score below grammar.SURE. begin and end: seconds since the first sample.
@@ -33,9 +33,9 @@ class Recogniser(Protocol):
 def recogniser() -> Recogniser:
     """The program's own. Raises ConfigError if it is not installed."""
     try:
-        made: Recogniser = importlib.import_module("valve_drake.voice").recogniser()
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"to listen needs the extra `voice`: pip install 'valve-drake[voice]' ({error})") from error
+        made: Recogniser = importlib.import_module("valve_drake.voice.recogniser").Recogniser()
+    except ImportError as error:
+        raise ConfigError(f"listening needs the extra `voice`: pip install 'valve-drake[voice]' ({error})") from error
     return made
 
 

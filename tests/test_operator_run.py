@@ -1,0 +1,158 @@
+"""Runs that an operator commands by words: what moves, what is answered, what the log holds, what a replay decides."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from operator_session import Session, ended, said
+
+from valve_drake import cli
+from valve_drake.analysis.conversation import exchanges
+from valve_drake.operator.grammar import Heard
+from valve_drake.operator.wire import RATE, Sound
+from valve_drake.recording import foxglove
+from valve_drake.recording.reader import LogReader
+
+QUICK = ["simulation.start.distance=2.6", "simulation.start.bearing=0.1", "simulation.start.heading=0.1", "seed=4"]
+
+
+def turned_by(log):
+    """True change of the valve's angle over the whole log [deg]."""
+    angles = [m.values[0] for _, _, m in log.messages(["/truth/valve_angle"])]
+    return math.degrees(angles[-1] - angles[0])
+
+
+def replayed(path, capsys):
+    capsys.readouterr()
+    assert cli.main(["replay", str(path), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)["identical"]
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """Opened, confirmed, stopped while it drives; sound beside."""
+    path = tmp_path_factory.mktemp("short") / "short.mcap"
+    session = Session(*QUICK, limit=8.0)
+
+    def hum(session):
+        session.desk.sound(Sound(session.now, 0, RATE, np.full(1280, 99, np.int16)))
+        session.desk.say(Heard("robot, open the valve", 0.9))
+
+    session.run(
+        path,
+        (lambda state: state.linked, hum),
+        (said("say confirm"), "confirm"),
+        (lambda state: state.mode == "search", "stop"),
+        (ended("stopped"), "robot, status"),
+        (said("stopped"), lambda session: None),
+    )
+    return session, path
+
+
+def test_words_begin_and_stop_a_run_and_the_log_holds_them_with_the_sound(short):
+    session, path = short
+    assert [mode for _, mode in session.modes] == ["idle", "search", "stopped"]
+    log = LogReader(path)
+    assert [(one.words, one.outcome) for one in exchanges(log) if one.words] == [
+        ("robot, open the valve", "asked"),
+        ("confirm", "given"),
+        ("stop", "given"),
+        ("robot, status", "answered"),
+    ]
+    ((_, _, sound),) = log.messages([foxglove.AUDIO])
+    assert (sound.format, sound.sample_rate) == ("pcm-s16", RATE)
+    assert np.frombuffer(sound.data, "<i2").tolist() == [99] * 1280
+
+
+def test_a_stop_changes_the_mode_within_a_tenth_of_a_second(short):
+    session, path = short
+    log = LogReader(path)
+    sent = next(t for _, t, m in log.messages(["/operator/packets"]) if any(p.words == "stop" for p in m.packets))
+    stopped = next(t for _, t, m in log.messages(["/supervisor/mode"]) if m.mode == "stopped")
+    assert 0 <= stopped - sent <= 0.1
+
+
+def test_the_replay_decides_the_same(short, capsys):
+    assert replayed(short[1], capsys)
+
+
+def test_the_same_words_at_the_same_times_give_the_same_decisions_whoever_speaks(short, tmp_path):
+    """The desks' numbers are random; what is decided is not."""
+    session, path = short
+    again = Session(*QUICK, limit=8.0)
+    again.run(
+        tmp_path / "again.mcap",
+        (lambda state: state.linked, "robot, open the valve"),
+        (said("say confirm"), "confirm"),
+        (lambda state: state.mode == "search", "stop"),
+        (ended("stopped"), "robot, status"),
+        (said("stopped"), lambda session: None),
+    )
+    assert again.modes == session.modes
+
+
+def test_a_replay_cannot_change_whether_operators_are_heard(short, capsys):
+    assert cli.main(["replay", str(short[1]), "--set", "operator_channel.wire=none"]) == 2
+    assert "operator_channel.wire" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_whole_session_by_words_opens_stops_in_mid_turn_and_closes(tmp_path, capsys):
+    """The valve stands in the middle of its travel, so that both ways are free."""
+    path = tmp_path / "session.mcap"
+    session = Session("seed=1", "simulation.valve.travel=3.0", "simulation.valve.position=1.0")
+    session.run(
+        path,
+        (lambda state: state.linked, "robot, open the valve"),
+        (said("open by 90 degrees: say confirm"), "confirm"),
+        (lambda state: state.mode == "turn" and state.turned >= 30, "stop"),
+        (ended("stopped"), "robot, close the valve by forty five degrees"),
+        (said("close by 45 degrees: say confirm"), "confirm"),
+        (ended("done"), lambda session: None),
+    )
+    modes = [mode for _, mode in session.modes]
+    assert modes.count("turn") == 2 and modes[-1] == "done" and "stopped" in modes
+    verdicts = [says for _, says in session.told if says.startswith(("stopped: ", "turned: "))]
+    assert [verdict.split(":")[0] for verdict in verdicts] == ["stopped", "turned"]
+    assert turned_by(LogReader(path)) == pytest.approx(31.0 - 45.0, abs=2.5)  # it stops within a degree or two
+    assert replayed(path, capsys)
+    assert cli.main(["review", str(path), "--html", str(tmp_path / "page.html")]) == 0
+    assert "What was said" in (tmp_path / "page.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_link_that_is_lost_in_mid_turn_holds_the_grasp_and_the_turn_goes_on_by_confirm(tmp_path, capsys):
+    path = tmp_path / "held.mcap"
+    session = Session("seed=1")
+    cut_at = []
+
+    def cut(session):
+        session.cut = True
+        cut_at.append(session.now)
+
+    def mended(state):
+        session.cut = session.cut and session.now < cut_at[0] + 8.0
+        return not session.cut and "say confirm to go on" in state.says
+
+    session.run(
+        path,
+        (lambda state: state.linked, "robot, open the valve"),
+        (said("say confirm"), "confirm"),
+        (lambda state: state.mode == "turn" and state.turned >= 30, cut),
+        (mended, "confirm"),
+        (ended("done"), lambda session: None),
+    )
+    assert session.modes[-1][1] == "done"
+    log = LogReader(path)
+    assert turned_by(log) == pytest.approx(90.0, abs=2.0)
+    times, angles = zip(*((t, m.values[0]) for _, t, m in log.messages(["/truth/valve_angle"])))
+    held = [a for t, a in zip(times, angles) if cut_at[0] + 2.0 <= t <= cut_at[0] + 8.0]
+    assert math.degrees(max(held) - min(held)) < 0.3  # it stands still
+    forces = [
+        np.linalg.norm(np.array([m.force_left, m.force_right]), axis=1).max()
+        for _, t, m in log.messages(["/hybrid_rotation/turn"])
+        if cut_at[0] + 2.0 <= t <= cut_at[0] + 8.0
+    ]
+    assert max(forces) < 30.0
+    assert replayed(path, capsys)
