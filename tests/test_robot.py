@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
-from robot_facts import MIRROR, ROBOT
+from robot_facts import MIRROR, ROBOT, robot_state
 from robot_variants import part, put, seven_joints, variant, with_roll
 
 from valve_drake import cli, named_files, resources, yaml_file
@@ -248,6 +248,46 @@ def test_pads_get_a_grid_of_contact_points_where_their_surfaces_are(tmp_path):
             assert points(robot, link) == pytest.approx(points(ROBOT, link) + [0, inwards * 5e-4, 0])
 
 
+def test_a_head_that_turns_the_other_way_looks_where_it_is_asked_to(tmp_path):
+    """A tilt that looks up as it grows, a pan to the right, a waist to the right: the gaze is the same."""
+
+    def edit(m):
+        for joint in ("neck_pitch", "neck_yaw", "waist"):
+            axis = part(m, "joint", joint).find("axis/xyz")
+            axis.text = " ".join(f"{-float(x):g}" for x in axis.text.split())
+        limit = part(m, "joint", "neck_pitch")
+        put(limit, "axis/limit/lower", "-1.1")
+        put(limit, "axis/limit/upper", "0.5")
+
+    scenario = load(None, [f"robot={variant(tmp_path, edit)}"])
+    robot = Robot.load(scenario.robot)
+    assert ROBOT.gaze_signs.tolist() == [1, 1, 1] and robot.gaze_signs.tolist() == [-1, -1, -1]
+    search, ours = (
+        next(block for block in make_blocks(s) if block.get_name() == "valve_search") for s in (scenario, load())
+    )
+    gaze = np.array([0.3, 0.4, -0.5])  # waist to the left, down, to the right
+    torso = search._torso(gaze, np.zeros(1))
+    assert torso.tolist() == [-0.3, -0.4, 0.5] and ours._torso(gaze, np.zeros(1)) == pytest.approx(gaze)
+    assert robot.X_BL(torso) == pytest.approx(ROBOT.X_BL(gaze))
+    assert search._seen(robot_state(torso=torso)).torso == pytest.approx(gaze)
+    up = load(None, [f"robot={tmp_path / 'robot.yaml'}", "valve_search.pitch_high=1.1", "valve_search.pitch_low=-0.5"])
+    make_blocks(up)  # its limits are those of the joint, turned about
+
+
+def test_a_fixed_base_hangs_on_the_world(tmp_path):
+    def edit(m):
+        for kind, name in (("joint", "base_x"), ("joint", "base_y"), ("joint", "base_yaw"),
+                           ("link", "base_x_carriage"), ("link", "base_y_carriage")):  # fmt: skip
+            m.remove(part(m, kind, name))
+
+    def fix(given):
+        given["base"] = {"frame": "B", "drive": "fixed", "speed": [], "acceleration": []}
+
+    robot = Robot.load(variant(tmp_path, edit, fix))
+    assert len(robot.base) == 0
+    assert robot.forward(LEFT, np.zeros(6)) == pytest.approx(ROBOT.forward(LEFT, np.zeros(6)))
+
+
 def test_the_pr2_is_described_by_its_file():
     robot = Robot.load(description.find("pr2/pr2.robot.yaml"))
     assert robot.posture.names == ("torso_lift_joint",) and robot.base.names == ("base_x", "base_y", "base_yaw")
@@ -327,9 +367,9 @@ WRONG = {
         at("gaze.tilt", "neck_yaw"),
         "gaze.tilt must be a joint of its own; gaze.pan has it, got 'neck_yaw'",
     ),
-    "a tilt that looks up": (
+    "a tilt that turns aside": (
         at("gaze", {"waist": "waist", "pan": "neck_pitch", "tilt": "neck_yaw"}),
-        "gaze.tilt must be a joint that looks down where it grows, got 'neck_yaw'",
+        "gaze.tilt must be a joint that turns the eye up and down, got 'neck_yaw'",
     ),
     "a gripper that opens too little": (
         at("opening", 0.12),
@@ -378,6 +418,7 @@ USELESS = {
         [],
         "arms.left.home and arms.right.home must be free of all: robot::",
     ),
+    "no tilt": ([at("gaze.tilt", "")], [], "gaze.tilt must be given: the search turns the eyes by it"),
     "no servo": ([at("servo", "none")], [], "servo must be camera"),
     "hands too small for the valve": ([at("opening", 0.03)], [], "opening must be at least 0.035: marker.handle_width"),
     "a selector that shuts the hands": ([], ["command_selector.gripper_high=0.08"], "opening must be at most command_"),

@@ -157,6 +157,8 @@ def robot_of(scenario: Scenario) -> Robot:
     d = robot.description
     try:
         require(d.servo == "camera", "servo", "camera (another way is not supported yet)", d.servo)
+        for key in ("pan", "tilt"):
+            require(bool(getattr(d.gaze, key)), f"gaze.{key}", "given: the search turns the eyes by it", "")
         require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
         _check_gaze(scenario.valve_search, robot)
         high, width = scenario.command_selector.gripper_high, scenario.marker.handle_width
@@ -172,6 +174,9 @@ def _check_gaze(search: ValveSearchConfig, robot: Robot) -> None:
     """The gaze is planned within what the robot's joints can do. Raises ConfigError."""
     limits = dict(zip(robot.torso.names, zip(robot.torso.low.tolist(), robot.torso.high.tolist())))
     waist, tilt, pan = robot.waist, robot.torso.names[-2], robot.torso.names[-1]
+    if robot.gaze_signs[1] < 0:  # pitches are downwards
+        low, high = limits[tilt]
+        limits[tilt] = -high, -low
 
     def symmetric(joint: str) -> tuple[float, float]:
         low, high = limits[joint]
@@ -292,6 +297,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             lambda base, torso: compose(robot.head_pose(base, torso), X_LEyes),
             robot.torso.home,
             robot.waist,
+            robot.gaze_signs,
         ),
         BaseApproachSystem(scenario.base_approach, marker),
         StancePlannerSystem(StancePlanner(scenario.stance_planner, stances)),

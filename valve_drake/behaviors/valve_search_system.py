@@ -42,7 +42,8 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
 
     head_pose: base (x, y, heading) in O, torso (n,) -> X_OL (3, 4). rest: the torso's joints at home (n,). waist: which
     of them is the waist; None: the robot has none. The last two are tilt and pan. The gaze is that of waist (0 if there
-    is none), tilt and pan. The lift is driven to the stance's in fine_approach, and stays there.
+    is none), tilt and pan. The lift is driven to the stance's in fine_approach, and stays there. signs: of waist, tilt
+    and pan: 1 for a joint that turns it to the left, down, left as it grows (3,); None: all do.
     """
 
     OUTPUTS = {"command": Command, "status": Status}
@@ -53,12 +54,14 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         head_pose: HeadPose,
         rest: np.ndarray,
         waist: int | None,
+        signs: np.ndarray | None = None,
         name: str = "valve_search",
     ):
         config.check()
         self.config = config if waist is not None else dc.replace(config, sweep_waist=0.0)
         self._rest, self._waist = rest, waist
-        self._plain = waist == 0 and len(rest) == 3  # the torso is the gaze
+        self._signs = np.ones(3) if signs is None else signs
+        self._plain = waist == 0 and len(rest) == 3 and bool((self._signs > 0).all())  # the torso is the gaze
         self._whole_pose = head_pose
         super().__init__(name, period=2 * TICK)
 
@@ -95,11 +98,11 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         if self._plain:
             return state
         waist = 0.0 if self._waist is None else state.torso[self._waist]
-        return dc.replace(state, torso=np.array([waist, *state.torso[-2:]]))
+        return dc.replace(state, torso=self._signs * [waist, *state.torso[-2:]])
 
     def _torso(self, gaze: np.ndarray, posture: np.ndarray) -> np.ndarray:
         """The torso's joints for waist, tilt and pan; posture: lift and waist, of which the lift counts."""
-        torso = self._rest.copy()
+        torso, gaze = self._rest.copy(), self._signs * gaze
         torso[: len(posture)] = posture
         torso[-2:] = gaze[1:]
         if self._waist is not None:

@@ -60,17 +60,13 @@ class LiftDescription(Config):
 
 @dc.dataclass
 class GazeDescription(Config):
-    """Key `gaze`: what turns the head. pan: to the left; tilt: downwards; waist: turns head and arms to the left."""
+    """Key `gaze`: what turns the head, whichever way it grows. waist: turns head and arms."""
 
     waist: str = plain("", "joint, where there is one")
-    pan: str = plain("", "joint")
-    tilt: str = plain("", "joint")
+    pan: str = plain("", "joint, to the left and right")
+    tilt: str = plain("", "joint, up and down")
     speed: float = number(1.5, 0.05, 10.0, "of pan and tilt, at most [rad/s]")
     waist_speed: float = number(0.8, 0.05, 10.0, "of the waist, at most [rad/s]")
-
-    def relations(self, key: str) -> None:
-        for name in ("pan", "tilt"):
-            require(bool(getattr(self, name)), f"{key}.{name}", "given", getattr(self, name))
 
 
 @dc.dataclass

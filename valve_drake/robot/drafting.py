@@ -383,8 +383,7 @@ def _gaze(robot: Robot, found: Guess, ask: Ask) -> list[str]:
             lines.append(f"  # {key}: " + ask(f"gaze.{key}: no such joint of a head was found")[2:])
         else:
             backwards = _axis(robot.joints[name], poses)[axis] < 0
-            note = "  " + ask(f"gaze.{key}: {name} turns the other way than {way}") if backwards else f"  # turns {way}"
-            lines.append(f"  {key}: {_key(name)}{note}")
+            lines.append(f"  {key}: {_key(name)}  # turns {'the other way than ' if backwards else ''}{way}")
     if found.waist:
         lines.append(f"  waist: {_key(found.waist)}")
     speeds = [robot.joints[name].limit("velocity") or 1.0 for name in (found.pan, found.tilt) if name]

@@ -108,8 +108,12 @@ def add_robot(plant: MultibodyPlant, robot: RobotDescription) -> ModelInstanceIn
         X = RigidTransform(RollPitchYaw(frame.rpy), frame.xyz)
         plant.AddFrame(FixedOffsetFrame(name, link, X, model))
     base = frame_named(plant, model, robot.base.frame, "base.frame")
-    if not base_chain(plant, model, base.body()) and robot.base.drive != "fixed":
-        _add_carriages(plant, model, base.body())
+    if not base_chain(plant, model, base.body()):
+        root = _root(plant, model, base.body())
+        if robot.base.drive != "fixed":
+            _add_carriages(plant, model, root)
+        elif root.index() != plant.world_body().index():
+            plant.WeldFrames(plant.world_frame(), root.body_frame())
     for key, name in named_joints(robot):
         joint = joint_named(plant, model, name, key)
         if joint.num_velocities() != 1:
@@ -206,10 +210,15 @@ def base_chain(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody
     return chain
 
 
-def _add_carriages(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> None:
-    """The joints base_x, base_y and base_yaw between the world and the model's root, with the body on the floor."""
+def _root(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> RigidBody:
+    """The body that carries this one and hangs on nothing itself."""
     while (joint := parent_joint(plant, model, body)) is not None:
         body = joint.parent_body()
+    return body
+
+
+def _add_carriages(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> None:
+    """The joints base_x, base_y and base_yaw between the world and the model's root."""
     little = SpatialInertia(CARRIAGE, [0, 0, 0], UnitInertia.SolidSphere(0.05))
     parent = plant.world_body()
     for name, axis in (("base_x", [1, 0, 0]), ("base_y", [0, 1, 0]), ("base_yaw", [0, 0, 1])):

@@ -97,6 +97,7 @@ class Robot:
     arms: Mapping[str, Arm]
     hands: Mapping[str, HandLoad]
     grippers: Mapping[str, Gripper]
+    gaze_signs: np.ndarray  # of waist, tilt, pan: 1 where it turns the eye to the left, down, left as it grows (3,)
     opening: float  # of an open gripper [m]
     home: np.ndarray  # both arms, left first (n + m,)
 
@@ -113,9 +114,9 @@ class Robot:
         held = [*lift, *(gaze[key] for key in ("waist",) if key in gaze)]
         rest = [*d.lift.home, *(0.0 for key in ("waist",) if key in gaze)]
         speed = [*d.lift.speed, *(d.gaze.waist_speed for key in ("waist",) if key in gaze)]
-        head = [gaze["tilt"], gaze["pan"]]
+        head = [gaze[key] for key in ("tilt", "pan") if key in gaze]
         self.posture = _joints(held, speed, rest)
-        self.torso = _joints([*held, *head], [*speed, d.gaze.speed, d.gaze.speed], [*rest, 0.0, 0.0])
+        self.torso = _joints([*held, *head], [*speed, *(d.gaze.speed for _ in head)], [*rest, *(0.0 for _ in head)])
         _check_within(self.posture, "lift.home")
         _check_speeds("lift.speed", lift, d.lift.speed)
         for name, turning in gaze.items():
@@ -143,7 +144,7 @@ class Robot:
         self._home_q = q
         self._chains = {side: self._chain(side, joint) for side in SIDES}
         self._check_sides()
-        self._check_gaze()
+        self.gaze_signs = _locked(self._gaze_signs())
         self.grippers = MappingProxyType({side: self._gripper(side, joint[f"grippers.{side}.joint"]) for side in SIDES})
         for side in SIDES:
             q[joint[f"grippers.{side}.joint"].position_start()] = self.grippers[side].position(d.opening)
@@ -364,15 +365,20 @@ class Robot:
                 f"arms.left must be to the left of arms.right, got shoulders at y = {left:.3g} and {right:.3g} m"
             )
 
-    def _check_gaze(self) -> None:
-        """Tilt looks down where it grows, pan to the left."""
-        for key, slot, row, sign, words in (("tilt", -2, 2, -1.0, "down"), ("pan", -1, 1, 1.0, "to the left")):
+    def _gaze_signs(self) -> np.ndarray:
+        """Read off the model by how the eye's axis moves; 1 for a joint that the robot lacks."""
+        d, signs = self.description.gaze, [1.0, 1.0, 1.0]
+        aside = "to the left and right"
+        ways = ("waist", 1, 1.0, aside), ("tilt", 2, -1.0, "up and down"), ("pan", 1, 1.0, aside)
+        for k, (key, row, sign, words) in enumerate(ways):
+            if not (name := getattr(d, key)):
+                continue
             torso = self.torso.home.copy()
-            torso[slot] += 0.1
-            moved = self.X_BL(torso)[row, 2] - self.X_BL(self.torso.home)[row, 2]
-            require(
-                sign * moved > 0.01, f"gaze.{key}", f"a joint that looks {words} where it grows", self.torso.names[slot]
-            )
+            torso[self.torso.names.index(name)] += 0.1
+            moved = sign * (self.X_BL(torso)[row, 2] - self.X_BL(self.torso.home)[row, 2])
+            require(abs(moved) > 0.01, f"gaze.{key}", f"a joint that turns the eye {words}", name)
+            signs[k] = math.copysign(1.0, moved)
+        return np.array(signs)
 
     def _gripper(self, side: str, joint: Joint) -> Gripper:
         """Opening over position, from the pads' distance along the closing direction; shut is the least."""
