@@ -12,6 +12,7 @@ from valve_drake.camera.lens import Lens, OpenCvLens
 from valve_drake.diagram import initial_commands, make_station
 from valve_drake.frames import apply, compose, inverse, make, planar
 from valve_drake.messages import SIDES
+from valve_drake.recording import schemas
 from valve_drake.stations import camera_rig, contract, simulated
 from valve_drake.stations.scene import panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, StartConfig, ValveConfig
@@ -73,7 +74,7 @@ def rig():
 def test_the_simulated_station_exports_exactly_the_contract(rig):
     contract.check_contract(rig.station, GROUPS)
     extra = set(contract.ports_of(rig.station)) - {spec.name for spec in contract.CONTRACT}
-    assert extra == {f"truth.{name}" for name in simulated.TruthSystem.OUTPUTS}
+    assert extra == {f"truth.{name}" for name in (*simulated.TruthSystem.OUTPUTS, "contacts")}
 
 
 def test_check_contract_names_what_is_missing_extra_and_different():
@@ -301,8 +302,9 @@ def state_of(station, context):
     """All that the plant keeps, as bytes."""
     inner = station.GetSubsystemByName("plant").GetMyContextFromRoot(context)
     values = inner.get_discrete_state()
-    assert inner.num_abstract_states() == inner.num_continuous_states() == 0
-    return b"".join(values.value(k).tobytes() for k in range(values.num_groups()))
+    assert inner.num_abstract_states() == 1 and inner.num_continuous_states() == 0
+    contacts = schemas.encode(inner.get_abstract_state(0).get_value())
+    return contacts + b"".join(values.value(k).tobytes() for k in range(values.num_groups()))
 
 
 def moved(station, context, arm, until):

@@ -538,3 +538,26 @@ class SelectorReport(Message):
     refused: tuple[str, ...] = ()  # what was refused, e.g. "base: not finite"
     tripped: tuple[str, ...] = ()  # hands whose force was above the trip since this mode was entered
     astray: tuple[str, ...] = ()  # groups that do not follow their command
+
+
+# ---------------------------------------------------------------- truth of a simulation
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Contacts(Message):
+    """What touches what, as only a simulation knows it; no controller reads it.
+
+    {side}_pads: how hard each of the hand's two pads presses on the valve's moving part towards the other pad; negative
+    where its outer side pushes [N]. {side}_slip: how fast the pads slide along it [m/s]. internal_force: the largest
+    part of a hand's force on the valve that does not help to turn it [N]. touching: every other pair of bodies of which
+    one is the robot's, "body, body", with the force between them [N].
+    """
+
+    time: float = 0.0
+    left_pads: np.ndarray = array(2)
+    right_pads: np.ndarray = array(2)
+    left_slip: float = 0.0
+    right_slip: float = 0.0
+    internal_force: float = 0.0
+    touching: tuple[str, ...] = ()
+    forces: np.ndarray = array(-1)  # one for each pair of `touching`

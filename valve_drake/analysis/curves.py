@@ -29,6 +29,7 @@ def make_plots(log: Traces) -> list[Plot]:
         _servo_error,
         _servo_speed,
         _forces,
+        _pads,
         _couple,
         _angle,
         _angle_difference,
@@ -142,6 +143,16 @@ def _forces(log: Traces) -> Plot:
         " positive compresses the bar."
     )
     return Plot("Forces on the hands", "N", lines, note, height=170, low=0.0, key="forces")
+
+
+def _pads(log: Traces) -> Plot:
+    lines: list[Line] = []
+    if (touches := log.touches) is not None and len(touches.time) > 1 and log.truth is not None:
+        time = log.truth.time
+        at = touches.at(time)
+        lines = [Line(f"{side} hand", time, touches.pads[side].min(axis=1)[at], SIDE_COLORS[side]) for side in SIDES]
+    note = "By the simulation\u2019s truth: a hand holds while both its pads press. Below zero an outer side pushes."
+    return Plot("Hold: the weaker pad of each hand", "N", lines, note, height=110, key="pads")
 
 
 def _couple(log: Traces) -> Plot:

@@ -6,12 +6,28 @@ import os
 
 import numpy as np
 
-from valve_drake.analysis.traces import Estimates, ModeSpan, Traces
+from valve_drake.analysis.traces import Estimates, ModeSpan, Touches, Traces
 from valve_drake.messages import SIDES, Mode
 from valve_drake.recording.reader import LogReader
 from valve_drake.task.modes import TERMINAL
 
 LOADED = 1.0  # below this couple the hands' shares are noise and are left out [N m]
+
+
+TURNED = 0.02  # a valve that moved less than this in all has not been turned [rad]
+SLIPPING = 0.005  # of pads along a handle; hands that hold creep by less than a fifth of it [m/s]
+PERIOD = 1 / 16  # of looks at the contacts [s]
+APART = 0.25  # two touches of one pair of bodies with less between them are one [s]
+
+
+@dc.dataclass(frozen=True)
+class Collision:
+    """Two bodies that should not have touched, one of them the robot's."""
+
+    bodies: str
+    time_s: float  # of the first touch
+    duration_s: float
+    peak_force_N: float
 
 
 @dc.dataclass(frozen=True)
@@ -66,6 +82,13 @@ class Summary:
     turn_peak_torque_Nm: float | None = None
     turn_peak_moment_Nm: float | None = None  # of one hand at its grip
     turn_share_left: float | None = None  # mean, where the couple exceeds 1 N m
+    # By the simulation's truth; None where the log has none. Of a hand: the share of the valve's way during which both
+    # its pads held (None too if the valve did not move), how often it slipped or lost hold while turning.
+    contact_honesty: dict[str, float] | None = None
+    slips: dict[str, int] | None = None
+    collisions: int | None = None
+    collided: list[Collision] = dc.field(default_factory=list)
+    peak_internal_force_N: float | None = None
     estimates: dict[str, EstimateNumbers] = dc.field(default_factory=dict)  # by mode
     pairs_looked_at: int = 0  # image pairs
     pairs_found: int = 0  # those in which the estimator found the marker
@@ -102,7 +125,7 @@ def summarize(log: str | os.PathLike[str] | LogReader | Traces) -> Summary:
         out.outcome = log.spans[-1].mode
     out.angle_camera_rad = log.verify_angle
     out.angle_true_rad = float(log.truth.angle[-1]) if log.truth is not None else None
-    for part in (_turning, _estimates, _servo, _joints, _health):
+    for part in (_turning, _contacts, _estimates, _servo, _joints, _health):
         log.attempt(part.__name__.removeprefix("_"), functools.partial(part, log, out), None)
     out.faults = log.faults
     if log.selector is not None:
@@ -143,6 +166,51 @@ def _turning(log: Traces, out: Summary) -> None:
     out.turn_peak_moment_Nm = float(max(turn["moment_left"][at].max(), turn["moment_right"][at].max()))
     loaded = torque > LOADED
     out.turn_share_left = float(turn["share_left"][at][loaded].mean()) if loaded.any() else None
+
+
+def _contacts(log: Traces, out: Summary) -> None:
+    touches, truth = log.touches, log.truth
+    if touches is None:
+        return
+    turning = log.inside(touches.time, Mode.TURN)
+    held = {side: touches.held(side) for side in SIDES}
+    out.peak_internal_force_N = float(touches.internal.max())
+    out.slips = {}
+    for side in SIDES:
+        sliding = held[side] & (touches.slip[side] > SLIPPING)
+        lost = np.append(False, held[side][:-1] & ~held[side][1:])
+        out.slips[side] = _begins(turning & sliding) + int((turning & lost).sum())
+    out.collided = _collisions(touches)
+    out.collisions = len(out.collided)
+    if truth is not None and len(truth.time) > 1:
+        way = np.abs(np.diff(truth.angle))
+        if way.sum() > TURNED:
+            at = touches.at(truth.time[1:])
+            out.contact_honesty = {side: float(way[held[side][at]].sum() / way.sum()) for side in SIDES}
+
+
+def _begins(happens: np.ndarray) -> int:
+    """How often something begins (n,) bool."""
+    return int(np.sum(happens & ~np.append(False, happens[:-1])))
+
+
+def _collisions(touches: Touches) -> list[Collision]:
+    """In the order of their beginnings. A row holds until the next one."""
+    ends = np.append(touches.time[1:], touches.time[-1:] + PERIOD)
+    out: list[Collision] = []
+    open_: dict[str, int] = {}  # bodies -> the last one's place in `out`
+    for time, end, others in zip(
+        touches.time.tolist(), np.minimum(ends, touches.time + PERIOD).tolist(), touches.others
+    ):
+        for bodies, force in others.items():
+            last = out[open_[bodies]] if bodies in open_ else None
+            if last is not None and time - last.time_s - last.duration_s < APART:
+                peak = max(last.peak_force_N, force)
+                out[open_[bodies]] = dc.replace(last, duration_s=end - last.time_s, peak_force_N=peak)
+            else:
+                open_[bodies] = len(out)
+                out.append(Collision(bodies, time, end - time, force))
+    return out
 
 
 def _estimates(log: Traces, out: Summary) -> None:

@@ -394,6 +394,13 @@ def tiles(s: Summary, pace: Pace | None = None) -> list[tuple[str, str, str]]:
             f"beyond the couple; peak {stem:.1f} N",
         )
         add("left hand\u2019s share", s.turn_share_left, lambda v: f"{100 * v:.1f} %", "of the couple")
+    if s.contact_honesty is not None and s.slips is not None:
+        least = min(s.contact_honesty.values())
+        shares = ", ".join(f"{side} {100 * share:.1f} %" for side, share in s.contact_honesty.items())
+        add("held by both pads", least, lambda v: f"{100 * v:.1f} %", f"of the valve\u2019s way, worse hand; {shares}")
+    if s.collisions is not None:
+        internal = s.peak_internal_force_N or 0.0
+        add("collisions", s.collisions, str, f"internal force at most {internal:.1f} N")
     rest = s.estimates.get(Mode.MEASURE)
     if rest is not None and rest.position_rms_m is not None and rest.angle_rms_rad is not None:
         add(

@@ -35,10 +35,12 @@ SCHEMAS = {  # of the topics that are read here
     "/truth/base_pose": "valve_drake.Vector",
     "/truth/marker_pose": "valve_drake.Vector",
     "/truth/valve_angle": "valve_drake.Vector",
+    "/truth/contacts": "valve_drake.Contacts",
 }
 # Bounds on memory: a topic with more messages is not decoded, a larger message [bytes] is left out, and of more stays
 # in modes the first are shown. Raise them for runs of hours.
 MOST, LARGEST, MOST_SPANS = 1_000_000, 1 << 20, 2000
+HELD = 1.0  # by each of both pads [N]: more than a touch, a tenth of what a pad needs to carry its share by friction
 T = TypeVar("T")
 D = TypeVar("D")
 HALF_TURN = make(rot_z(np.pi), np.zeros(3))
@@ -120,6 +122,25 @@ class Truth:
     base: np.ndarray  # x, y [m], heading [rad] in W, continuous (N, 3)
     X_WV: np.ndarray  # (N, 3, 4)
     angle: np.ndarray  # turned since the start, positive opens (N,) [rad]
+
+
+@dc.dataclass(frozen=True)
+class Touches:
+    """What touched what, by a simulation's truth; row k holds from time[k] until the next one."""
+
+    time: np.ndarray  # (N,) [s]
+    pads: dict[str, np.ndarray]  # by side, both pads' pressing on the valve (N, 2) [N]
+    slip: dict[str, np.ndarray]  # of the pads along the valve (N,) [m/s]
+    internal: np.ndarray  # largest part of a hand's force that does not turn the valve (N,) [N]
+    others: list[dict[str, float]]  # bodies that touched besides -> force [N]
+
+    def held(self, side: str) -> np.ndarray:
+        """When both pads of a hand pressed on the valve -> (N,) bool."""
+        return np.asarray(self.pads[side].min(axis=1) > HELD)
+
+    def at(self, time: np.ndarray) -> np.ndarray:
+        """Which row holds at instants (M,) -> (M,); the first one before all rows."""
+        return np.clip(np.searchsorted(self.time, time + 1e-6, side="right") - 1, 0, None)
 
 
 class _Trace(functools.cached_property[T | None]):
@@ -227,6 +248,22 @@ class Traces:
         base, marker, angle = (np.array([found[t] for t in when]) for found in rows)
         base = np.column_stack([base[:, :2], np.unwrap(base[:, 2])])
         return Truth(np.array(when), base, marker.reshape(-1, 3, 4), angle[:, 0] - angle[0, 0])
+
+    @_Trace
+    def touches(self) -> Touches | None:
+        rows = self._messages("/truth/contacts")
+        if not rows:
+            return None
+        for _, row in rows:
+            if len(row.touching) != len(row.forces):
+                raise ValueError("/truth/contacts: a force for each pair")
+        return Touches(
+            np.array([time for time, _ in rows]),
+            {side: np.array([getattr(m, f"{side}_pads") for _, m in rows]) for side in SIDES},
+            {side: np.array([getattr(m, f"{side}_slip") for _, m in rows]) for side in SIDES},
+            np.array([m.internal_force for _, m in rows]),
+            [dict(zip(m.touching, m.forces.tolist())) for _, m in rows],
+        )
 
     @_Trace
     def estimates(self) -> Estimates | None:

@@ -173,3 +173,13 @@ def print_summary(console: "Console", s: "Summary") -> None:
             f"while turning: peak {s.turn_peak_hand_force_N:.1f} N a hand, mean {s.turn_mean_hand_force_N:.1f} N, "
             f"stem beyond the couple {s.turn_mean_stem_force_N:.1f} N mean"
         )
+    if s.contact_honesty is not None and s.slips is not None:
+        held = ", ".join(f"{side} {100 * share:.1f} %" for side, share in s.contact_honesty.items())
+        console.print(
+            f"held by both pads, of the valve's way: {held}; slips {sum(s.slips.values())}, "
+            f"internal force at most {s.peak_internal_force_N or 0.0:.1f} N"
+        )
+    for found in s.collided:
+        console.print(
+            styled(("collision", "red"), f" {found.bodies} at {found.time_s:.2f} s, {found.peak_force_N:.1f} N at most")
+        )

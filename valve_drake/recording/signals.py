@@ -9,7 +9,8 @@
 /events  /log             foxglove.Event, foxglove.Log
 /health  /operator/command   the station's and the program's own messages
 /operator/packets            what operators' desks have sent; /operator/audio: foxglove.RawAudio, as it came
-/truth/...                schemas.Vector: simulation only; left out when the ports are not connected
+/truth/...                schemas.Vector, and /truth/contacts as messages.Contacts: simulation only; left out when the
+                          ports are not connected
 """
 
 import operator
@@ -25,6 +26,7 @@ from valve_drake.messages import (
     SIDES,
     CameraFrame,
     Command,
+    Contacts,
     GraspPlan,
     HandleMarks,
     Health,
@@ -99,6 +101,7 @@ TRUTH: dict[str, tuple[str, ...]] = {  # port of the simulated station -> names 
     "truth.marker_pose": tuple(f"X_WV_{row}{column}" for row in range(3) for column in range(4)),
     "truth.stem_wrench": ("tx", "ty", "tz", "fx", "fy", "fz"),
 }
+CONTACTS = "truth.contacts"
 
 
 def measured(groups: Groups) -> dict[str, tuple[str, ...]]:
@@ -170,6 +173,7 @@ def signals(
         rows += [Signal("/scene", {}, lambda time: looks, period=ONCE)]
     rows += [*mode_events(), operator_line(), health_line(), *(status_line(block) for block in BEHAVIORS)]
     rows += [vector(topic_of(port), port, names, SLOW) for port, names in TRUTH.items()]
+    rows += [Signal(topic_of(CONTACTS), {CONTACTS: Contacts}, as_it_is, SLOW)]
     return rows
 
 

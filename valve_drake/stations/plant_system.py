@@ -14,6 +14,7 @@ import threading
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+from pydrake.common.value import Value
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import (
@@ -31,6 +32,7 @@ from valve_drake.messages import SIDES
 from valve_drake.ports import SLOT, TICK, PythonSystem
 from valve_drake.robot.groups import GROUPS
 from valve_drake.robot.robot import Robot
+from valve_drake.stations import contacts
 from valve_drake.stations.contract import CONTRACT, vectors
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.servos import add_servos, ignore_touching
@@ -56,6 +58,7 @@ class PlantSystem(PythonSystem):
                                                      the child's frame: the wrist sensors and the valve's stem
     left_opening, right_opening      out  vector(1)  between the pads [m]
     left_grip, right_grip            out  vector(1)  force of the finger actuator that closes, in the last step [N]
+    contacts                         out  Contacts   what touched what in the last step, a look every 1/16 s
 
     Slot 2 of tick k finds the commands of tick k - 1 at its ports, since command_selector replaces them at the same
     instant, and makes the state of t_(k+1) from that of t_k. So a command of tick k moves the joints from t_(k+1) on,
@@ -140,6 +143,8 @@ class PlantSystem(PythonSystem):
         self._fixed_feed_forward, self._feed_forward = self._fix("feed_forward", np.zeros(len(joints)))
         self._net_actuation = self.plant.get_net_actuation_output_port(self.robot)
         self._reaction_forces = self.plant.get_reaction_forces_output_port()
+        self._contact_results = self.plant.get_contact_results_output_port()
+        self._reader = contacts.ContactReader(self.plant, self.robot, self.valve, robot)
         loaded = {side: robot.description.arm(side).sensor for side in SIDES} | {STEM: STEM}  # output port -> joint
         present = list(self.plant.GetJointIndices())  # a welded joint has left its index unused
         self._loads = [present.index(self.plant.GetJointByName(name).index()) for name in loaded.values()]
@@ -151,11 +156,14 @@ class PlantSystem(PythonSystem):
         still = self._measured_grips(self.plant.GetPositionsAndVelocities(self._inner), np.zeros(len(joints)))
         self._grip = [self.DeclareDiscreteState([value]) for value in still]
         wrenches, numbers = [6] * len(loaded), [1] * len(still)
-        self._parts = [nx, len(self.base), len(self.actuated), *wrenches, *numbers]  # sizes of what a tick makes
-        self._ends = list(itertools.accumulate([nx, len(self.base), *sizes.values()]))  # in what it is made of
+        self._contacts = self.DeclareAbstractState(Value(contacts.NONE))
+        makes = [nx, len(self.base), len(self.actuated), *wrenches, *numbers, contacts.SIZE]  # sizes, in a tick
+        self._parts = makes
+        self._ends = list(itertools.accumulate([nx, len(self.base), 1, *sizes.values()]))  # in what it is made of
         self._beside: Beside | None = None
         self.DeclareStateOutputPort("state", self._x)
         self.DeclareStateOutputPort("actuation", self._actuation)
+        self.DeclareStateOutputPort("contacts", self._contacts)
         for name, index in zip(loaded, self._load):
             self.DeclareStateOutputPort(name, index)
         for name, index in zip((f"{side}_{what}" for side in SIDES for what in ("opening", "grip")), self._grip):
@@ -246,10 +254,16 @@ class PlantSystem(PythonSystem):
                 self._beside = None
 
     def _question(self, context: Context) -> np.ndarray:
-        """All that the next tick depends on: x, the base's set point, the commands."""
+        """All that the next tick depends on: x, the base's set point, whether contacts are looked at, the commands."""
         state = context.get_discrete_state()
-        parts = (state.value(self._x), state.value(self._base), *(read(context) for read in self._reads))
+        look = [float(self._looks(context))]
+        parts = (state.value(self._x), state.value(self._base), look, *(read(context) for read in self._reads))
         return np.concatenate(parts)
+
+    @staticmethod
+    def _looks(context: Context) -> bool:
+        """Whether the recorder wants the contacts of the state to come; asked in slot 2, or in slot 3 before."""
+        return _made(context) % contacts.EVERY == 0
 
     def _begin(self, context: Context) -> None:
         if self._beside is not None:
@@ -265,14 +279,19 @@ class PlantSystem(PythonSystem):
         for index, size in zip((self._x, self._base, self._actuation, *self._load, *self._grip), self._parts):
             values.set_value(index, answer[start : start + size])
             start += size
+        if self._looks(context):
+            kept = state.get_mutable_abstract_state().get_mutable_value(self._contacts)
+            kept.set_value(self._reader.message(answer[start:], _made(context) * TICK, kept.get_value()))
 
     def _advance(self, question: np.ndarray) -> np.ndarray:
-        """One tick. It depends on the question alone -> x, the base's set point, actuation, loads, grips."""
-        x, base, *commands = (question[a:b] for a, b in itertools.pairwise((0, *self._ends)))
+        """One tick. It depends on the question alone -> x, the base's set point, actuation, loads, grips, contacts."""
+        x, base, look, *commands = (question[a:b] for a, b in itertools.pairwise((0, *self._ends)))
         with self._lock:
-            return np.concatenate(self._step(x, base, dict(zip(self._inputs, commands))))
+            return np.concatenate(self._step(x, base, bool(look[0]), dict(zip(self._inputs, commands))))
 
-    def _step(self, x: np.ndarray, base: np.ndarray, commands: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+    def _step(
+        self, x: np.ndarray, base: np.ndarray, look: bool, commands: dict[str, np.ndarray]
+    ) -> tuple[np.ndarray, ...]:
         scratch, desired = self._scratch, self._desired
         start: _Pose = tuple(base.tolist())
         twist: tuple[float, float] = tuple(commands["base.twist_command"].tolist())
@@ -294,7 +313,16 @@ class PlantSystem(PythonSystem):
         actuation = self._net_actuation.Eval(self._inner)
         forces = self._reaction_forces.Eval(self._inner)
         loads = [forces[k].get_coeffs() for k in self._loads]
-        return x, np.array(_driven(start, twist, TICK)), actuation, *loads, self._measured_grips(x, actuation)
+        touching = contacts.NOTHING
+        if look:
+            touching = self._reader.look(self._contact_results.Eval(self._inner), self._inner)
+        held = self._measured_grips(x, actuation)
+        return x, np.array(_driven(start, twist, TICK)), actuation, *loads, held, touching
+
+
+def _made(context: Context) -> int:
+    """Which tick's state the update of slot 2 makes; asked then, or in slot 3 before."""
+    return (round(context.get_time() / SLOT) + 1) // round(TICK / SLOT) + 1
 
 
 def _driven(base: _Pose, twist: tuple[float, float], time: float) -> _Pose:

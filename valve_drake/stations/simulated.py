@@ -355,6 +355,7 @@ def make_simulated_station(
     builder.Connect(physics.GetOutputPort("stem"), truth.GetInputPort("stem_load"))
     for name in TruthSystem.OUTPUTS:
         builder.ExportOutput(truth.GetOutputPort(name), TRUTH + name)
+    builder.ExportOutput(physics.GetOutputPort("contacts"), TRUTH + "contacts")
 
     if meshcat is not None:
         view = _add_view(builder, positions.get_output_port(), valve, marker_size, meshcat, robot.description)
