@@ -58,7 +58,7 @@ def main(log: Path, folder: Path) -> None:
     rig = CameraRig(
         make_mounts(head, simulation, scenario.seed, robot.description.cameras),
         simulation.valve,
-        tuple(scenario.marker.size),
+        scenario.valve,
         simulation.light,
         simulation.camera,
         scenario.seed,

@@ -77,10 +77,10 @@ def draw_valve(drawing: Drawing, X_CV: np.ndarray, marker: Marker, marks: bool =
     def at(x: float, y: float, z: float) -> np.ndarray:
         return frames.compose(X_CV, frames.make(np.eye(3), np.array([x, y, z])))
 
-    r = marker.handle_radius
-    drawing.shape(at(0, 0, marker.mark_depth + 0.001), METAL, (r + 0.03, 0.0125))
+    r, _, depth = (float(n) for n in marker.marks[0])
+    drawing.shape(at(0, 0, depth + 0.001), METAL, (r + 0.03, 0.0125))
     for x in (-r, r) if marks else ():
-        drawing.shape(at(x, 0, marker.mark_depth), GREEN, (0.020, 0.011))
+        drawing.shape(at(x, 0, depth), GREEN, (0.020, 0.011))
     plate = 1.5 * max(marker.size) / 2
     drawing.shape(at(0, 0, 0.001), PLATE, (plate, plate), "disc")
     drawing.shape(X_CV, RED, (marker.size[0] / 2, marker.size[1] / 2))

@@ -23,12 +23,13 @@ from valve_drake.messages import (
     StereoPosition,
     Verdict,
 )
-from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK
+from valve_drake.valve.valve import Valve
 
 DT = 1 / 64  # half the real rate: the laws do not depend on it, and the tests are quicker
 CONFIG = BaseApproachConfig()
-MARKER = Marker()
+VALVE = Valve()
+DEPTH = 0.131  # of our panel behind the marker [m]
 STANCE = 0.72  # base to the panel [m]
 
 
@@ -49,6 +50,11 @@ class Wheels:
         self.pose = self.pose + DT * np.array([v * np.cos(middle), v * np.sin(middle), w])
 
 
+def valve(depth: float) -> Valve:
+    """Our valve, its panel so far behind its marker."""
+    return dc.replace(VALVE, panel=dc.replace(VALVE.panel, depth=depth + VALVE.marker.xyz[2]))
+
+
 @dc.dataclass
 class Scene:
     """A marker at (x, y, heading of the normal into the panel); what stages 1 to 3 say of it, 8 times a second."""
@@ -56,7 +62,7 @@ class Scene:
     marker: np.ndarray
     rng: np.random.Generator
     noise: float = 1.0
-    depth: float = MARKER.panel_depth  # of the panel behind the marker [m]
+    depth: float = DEPTH  # of the panel behind the marker [m]
 
     def stance(self) -> np.ndarray:
         x, y, h = self.marker
@@ -111,9 +117,7 @@ def drive(mode, wheels, scene, *, limit=40.0, config=CONFIG, alter=None, visible
         robot = RobotState(time=t, odometry=odometry)
         if watch:
             watch(robot, state, seen)
-        memory, command, status = step(
-            config, dc.replace(MARKER, panel_depth=scene.depth), memory, t, DT, robot, state, *seen
-        )
+        memory, command, status = step(config, valve(scene.depth), memory, t, DT, robot, state, *seen)
         wheels.drive(command.base_twist)
         poses.append(wheels.pose)
         twists.append(command.base_twist)
@@ -244,7 +248,7 @@ def test_fine_approach_ignores_single_wild_stances():
     assert_clear(run, scene, place(scene, 0.3, 1.8))
 
 
-@pytest.mark.parametrize("depth", [0.05, MARKER.panel_depth, 0.30])
+@pytest.mark.parametrize("depth", [0.05, DEPTH, 0.30])
 def test_fine_approach_brakes_for_a_stance_at_the_very_edge_of_the_forbidden_zone(depth):
     """Whatever the stem's length: the clearance is kept from the panel, not from a place behind the marker."""
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0, depth=depth)
@@ -260,7 +264,7 @@ def test_fine_approach_brakes_for_a_stance_at_the_very_edge_of_the_forbidden_zon
     assert CONFIG.clearance < scene.clear(run.poses) < CONFIG.clearance + 0.02
 
 
-@pytest.mark.parametrize("depth", [0.05, MARKER.panel_depth, 0.30])
+@pytest.mark.parametrize("depth", [0.05, DEPTH, 0.30])
 def test_fine_approach_refuses_a_stance_within_the_clearance(depth):
     """A stance 5 cm too near to the panel. With a short stem panel and stance are nearer to the marker."""
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0, depth=depth)
@@ -396,7 +400,7 @@ def test_outside_its_modes_it_is_idle_and_asks_for_nothing(mode):
     robot = RobotState(odometry=np.zeros(5))
     _, command, status = step(
         CONFIG,
-        MARKER,
+        VALVE,
         Memory(),
         1.0,
         DT,
@@ -417,7 +421,7 @@ def test_a_new_activation_starts_afresh():
             t = len(result) * DT
             seen = scene.look(t, robot.odometry[:3])
             mode = ModeState(mode="rough_approach", activation=activation)
-            memory, _, status = step(CONFIG, MARKER, memory, t, DT, robot, mode, *seen)
+            memory, _, status = step(CONFIG, VALVE, memory, t, DT, robot, mode, *seen)
             result.append((status.activation, status.state))
     assert result[199] == (1, "succeeded")
     assert result[200] == (2, "running")
@@ -436,7 +440,7 @@ def test_bad_config_is_refused_by_name(changes, words):
     with pytest.raises(ConfigError, match=words):
         BaseApproachConfig(**changes).check()
     with pytest.raises(ConfigError, match=words):
-        BaseApproachSystem(BaseApproachConfig(**changes), MARKER)
+        BaseApproachSystem(BaseApproachConfig(**changes), VALVE)
 
 
 # ---------------------------------------------------------------- block
@@ -449,11 +453,11 @@ def rig(**inputs) -> Rig:
         "mode": ModeState(mode="rough_approach", activation=1),
         "position": StereoPosition(time=0.001, found=True, covariance=np.eye(3) * 1e-4),
     }
-    return Rig(BaseApproachSystem(CONFIG, MARKER), **fixed | inputs)
+    return Rig(BaseApproachSystem(CONFIG, VALVE), **fixed | inputs)
 
 
 def test_ports():
-    assert ports(BaseApproachSystem(CONFIG, MARKER)) == {
+    assert ports(BaseApproachSystem(CONFIG, VALVE)) == {
         "robot_state": "in abstract",
         "mode": "in abstract",
         "position": "in abstract",
@@ -486,7 +490,7 @@ def test_block_refuses_a_wrong_message_and_needs_the_robot_state():
     with pytest.raises(TypeError, match="want Stance"):
         rig(stance=StereoPosition(), mode=ModeState(mode="fine_approach", activation=1)).run(0.1)
     with pytest.raises(RuntimeError, match="robot_state.*base_approach.*nothing is connected"):
-        Rig(BaseApproachSystem(CONFIG, MARKER), mode=ModeState(mode="retreat", activation=1)).run(0.1)
+        Rig(BaseApproachSystem(CONFIG, VALVE), mode=ModeState(mode="retreat", activation=1)).run(0.1)
 
 
 # ---------------------------------------------------------------- odometry

@@ -563,7 +563,7 @@ def test_stereo_photographs_reproduce_the_reference_solution(chess):
 def test_refined_pose_of_the_boards_rim_agrees_with_the_boards_own(chess):
     result, board = chess
     head, model = result.fit.head(), board.points().reshape(board.rows, board.columns, 3)
-    marker = Marker(size=list(np.ptp(model[..., :2], axis=(0, 1))), handle_radius=0.2)
+    marker = Marker.of(np.ptp(model[..., :2], axis=(0, 1)).tolist(), 0.2)
     config = RectangleEstimatorConfig(min_distance=0.1)
     for view, X_LT in zip(result.views, result.fit.poses):
         quads = [rim(px.reshape(board.rows, board.columns, 2), lens) for px, lens in zip(view.px, head.lenses())]

@@ -23,7 +23,7 @@ def rig_arguments():
     sc = scenario.resolve(scenario.load(None, ["seed=5", "simulation.camera.noise=2", "simulation.camera.blur=0.5"]))
     head = load_head(named_files.find(sc, "head_calibration"))
     mounts = make_mounts(head, sc.simulation, 5, ROBOT.description.cameras)
-    return mounts, sc.simulation.valve, tuple(sc.marker.size), sc.simulation.light, sc.simulation.camera, 5
+    return mounts, sc.simulation.valve, sc.valve, sc.simulation.light, sc.simulation.camera, 5
 
 
 @pytest.fixture(scope="module")

@@ -6,91 +6,93 @@ from robot_facts import ARMS_HOME as HOME
 from robot_facts import ROBOT
 from robot_variants import variant
 
-from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances, hand_in_valve, standoff, turned
+from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances, standoff
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import SIDES
-from valve_drake.perception.marker import Marker
 from valve_drake.robot.robot import Robot
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
+from valve_drake.valve.valve import Valve, turned
 
-MARKER = Marker()
+VALVE = Valve()
 ON_BAR = (0.0, 0.03, 0.0)  # off the handle, in the hand: a finger touches the bar [m]
 STRAIGHT = dict.fromkeys(SIDES, np.array([0.0, 0, 1]))
 
 
 def stances(config: StanceConfig) -> Stances:
-    return Stances(ROBOT, MARKER, config, STRAIGHT, lambda *_: True)
+    return Stances(ROBOT, VALVE, config, STRAIGHT, lambda *_: True)
 
 
 @pytest.fixture(scope="module")
 def model():
-    return CollisionModel(ROBOT, MARKER)
+    return CollisionModel(ROBOT)
 
 
 @pytest.fixture(scope="module")
-def X_BV():
-    X_OV = compose(panel_pose(ValveConfig(height=1.0)), make(np.eye(3), np.array([0, 0, -MARKER.panel_depth])))
+def X_BA():
+    X_OA = compose(panel_pose(ValveConfig(height=1.0)), inverse(VALVE.X_AP()))
     config = StanceConfig(distance_min=0.7, distance_max=0.78)
-    place, margin = stances(config).find(X_OV, np.pi / 2)
+    place, margin = stances(config).find(X_OA, np.pi / 2)
     assert margin > 0.5
-    return compose(inverse(planar(*place.base)), X_OV)
+    return compose(inverse(planar(*place.base)), X_OA)
 
 
-def arms(X_BV: np.ndarray, *, back: float = 0.0, aside=(0.0, 0.0, 0.0)) -> np.ndarray:
+def arms(X_BA: np.ndarray, *, back: float = 0.0, aside=(0.0, 0.0, 0.0)) -> np.ndarray:
     """Both hands on their handles, drawn back from the panel by `back` and moved by `aside` (in the hand) [m]."""
-    arc = stances(StanceConfig()).best_arc(X_BV, np.pi / 2)
+    arc = stances(StanceConfig()).best_arc(X_BA, np.pi / 2)
     q = []
     for side, near in arc.q.items():
-        X_BG = standoff(compose(X_BV, hand_in_valve(side, arc.swapped, MARKER)), STRAIGHT[side], back)
+        X_BG = standoff(
+            compose(X_BA, VALVE.grasp(arc.grasps[side].handle, arc.grasps[side].sign)), STRAIGHT[side], back
+        )
         q.append(ROBOT.inverse(side, make(X_BG[:, :3], X_BG[:, 3] + X_BG[:, :3] @ aside), near))
     return np.concatenate(q)
 
 
-def test_home_is_free_with_and_without_a_valve(model, X_BV):
+def test_home_is_free_with_and_without_a_valve(model, X_BA):
     assert model.is_free(None, HOME)
-    assert model.is_free(X_BV, HOME)
-    assert model.touching(X_BV, HOME) == []
+    assert model.is_free(X_BA, HOME)
+    assert model.touching(X_BA, HOME) == []
 
 
-def test_hands_before_the_handles_are_free(model, X_BV):
+def test_hands_before_the_handles_are_free(model, X_BA):
     for back in (0.08, 0.12, 0.16):
-        assert model.is_free(X_BV, arms(X_BV, back=back)), model.touching(X_BV, arms(X_BV, back=back))
+        assert model.is_free(X_BA, arms(X_BA, back=back)), model.touching(X_BA, arms(X_BA, back=back))
 
 
-def test_open_fingers_fit_round_the_bar_with_the_same_room_on_both_sides(X_BV):
+def test_open_fingers_fit_round_the_bar_with_the_same_room_on_both_sides(X_BA):
     """Robot, valve and grasp agree to the millimetre: (85 - 25) / 2 from every pad to the bar."""
-    wide = CollisionModel(ROBOT, MARKER, 0.05, opening=0.085)
-    rows = [line for line in wide.touching(X_BV, arms(X_BV)) if "::pad" in line and "::bar" in line]
+    wide = CollisionModel(ROBOT, 0.05, opening=0.085)
+    rows = [line for line in wide.touching(X_BA, arms(X_BA)) if "::pad" in line and "::bar" in line]
     assert len(rows) == 24 and all(row.endswith(": 30 mm") for row in rows)
 
 
-def test_a_finger_on_the_bar_is_not_free(model, X_BV):
-    q = arms(X_BV, aside=ON_BAR)
-    assert not model.is_free(X_BV, q)
-    names = "\n".join(model.touching(X_BV, q))
+def test_a_finger_on_the_bar_is_not_free(model, X_BA):
+    q = arms(X_BA, aside=ON_BAR)
+    assert not model.is_free(X_BA, q)
+    names = "\n".join(model.touching(X_BA, q))
     assert "bar" in names and "pad" in names
     assert model.is_free(None, q)  # without the valve it is
 
 
-def test_fingers_less_open_have_less_room(X_BV):
-    assert not CollisionModel(ROBOT, MARKER, opening=0.04).is_free(X_BV, arms(X_BV))
+def test_fingers_less_open_have_less_room(X_BA):
+    assert not CollisionModel(ROBOT, opening=0.04).is_free(X_BA, arms(X_BA))
 
 
-def test_one_hand_is_enough(model, X_BV):
-    q = arms(X_BV, aside=ON_BAR)
+def test_one_hand_is_enough(model, X_BA):
+    q = arms(X_BA, aside=ON_BAR)
     for k in range(2):
         one = HOME.copy()
         one[6 * k : 6 * k + 6] = q[6 * k : 6 * k + 6]
-        assert not model.is_free(X_BV, one)
+        assert not model.is_free(X_BA, one)
         assert model.is_free(None, one)
 
 
-def test_a_hand_in_the_panel_is_not_free(model, X_BV):
-    q = arms(X_BV, back=-0.09, aside=(0.0, 0.10, 0.0))  # beside the bar, too deep
-    names = "\n".join(model.touching(X_BV, q))
-    assert not model.is_free(X_BV, q)
+def test_a_hand_in_the_panel_is_not_free(model, X_BA):
+    q = arms(X_BA, back=-0.09, aside=(0.0, 0.10, 0.0))  # beside the bar, too deep
+    names = "\n".join(model.touching(X_BA, q))
+    assert not model.is_free(X_BA, q)
     assert "plate" in names
 
 
@@ -100,28 +102,26 @@ def test_hands_that_touch_each_other_are_not_free(model):
     assert not model.is_free(None, q)
 
 
-def test_clearance_is_the_distance_that_counts(X_BV):
+def test_clearance_is_the_distance_that_counts(X_BA):
     """The same pose, nearer than one clearance and further than the other."""
-    q = arms(X_BV, back=0.05)
-    distances = [
-        float(line.split(": ")[1].split(" ")[0]) for line in CollisionModel(ROBOT, MARKER, 0.2).touching(X_BV, q)
-    ]
+    q = arms(X_BA, back=0.05)
+    distances = [float(line.split(": ")[1].split(" ")[0]) for line in CollisionModel(ROBOT, 0.2).touching(X_BA, q)]
     least = min(distances) / 1e3
     assert 0.012 < least < 0.2
-    assert not CollisionModel(ROBOT, MARKER, least + 0.005).is_free(X_BV, q)
-    assert CollisionModel(ROBOT, MARKER, least - 0.005).is_free(X_BV, q)
+    assert not CollisionModel(ROBOT, least + 0.005).is_free(X_BA, q)
+    assert CollisionModel(ROBOT, least - 0.005).is_free(X_BA, q)
 
 
-def test_the_bar_turns_with_the_marker(model, X_BV):
-    q = arms(X_BV, aside=ON_BAR)
-    assert not model.is_free(X_BV, q)
-    assert model.is_free(turned(X_BV, np.pi / 4), q)
-    assert not model.is_free(turned(X_BV, np.pi), q)
+def test_the_bar_turns_with_the_marker(model, X_BA):
+    q = arms(X_BA, aside=ON_BAR)
+    assert not model.is_free(X_BA, q)
+    assert model.is_free(turned(X_BA, np.pi / 4), q)
+    assert not model.is_free(turned(X_BA, np.pi), q)
 
 
-def test_every_question_is_answered_afresh(model, X_BV):
-    q = arms(X_BV, aside=ON_BAR)
-    answers = [model.is_free(X, p) for X, p in ((X_BV, q), (None, q), (X_BV, HOME), (X_BV, q), (None, HOME))]
+def test_every_question_is_answered_afresh(model, X_BA):
+    q = arms(X_BA, aside=ON_BAR)
+    answers = [model.is_free(X, p) for X, p in ((X_BA, q), (None, q), (X_BA, HOME), (X_BA, q), (None, HOME))]
     assert answers == [False, True, True, False, True]
 
 
@@ -136,7 +136,7 @@ def test_what_touches_at_home_may_touch_if_the_robot_says_so(tmp_path):
     free = {}
     for ignore in ("", "touching_at_home"):
         robot = Robot.load(variant(tmp_path / ignore, change=lambda given, ignore=ignore: make_home(given, ignore)))
-        model = CollisionModel(robot, MARKER)
+        model = CollisionModel(robot)
         free[ignore] = model.is_free(None, robot.home)
         inwards = np.zeros(12)
         inwards[[1, 7]] = -0.3, 0.3

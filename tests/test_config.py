@@ -21,10 +21,10 @@ from valve_drake.checks import ConfigError
 from valve_drake.config import Config, Number, Uniform, number, numbers, plain, table
 from valve_drake.frames import make, rot_x, rot_y
 from valve_drake.messages import SIDES
-from valve_drake.perception.marker import Marker
 from valve_drake.scenario import Scenario
 from valve_drake.stations.faults import FaultConfig
 from valve_drake.stations.lcm_channels import DEVICES
+from valve_drake.valve.valve import Valve
 
 LEAVES = {leaf.key: leaf for leaf in config.leaves(Scenario())}
 
@@ -220,7 +220,7 @@ def test_the_longest_search_for_a_stance_that_a_scenario_allows_ends_soon():
     X_OV = make(rot_y(math.pi / 2) @ rot_x(-math.pi / 2) @ np.eye(3), np.array([2.0, 0, 1.0]))
     straight = {side: np.array([0.0, 0, 1.0]) for side in SIDES}
     begin = time.process_time()
-    Stances(ROBOT, Marker(), longest, straight, lambda *_: True).find(X_OV, 6.29)
+    Stances(ROBOT, Valve(), longest, straight, lambda *_: True).find(X_OV, 6.29)
     assert time.process_time() - begin < 5.0  # 40 distances x 2 x 64 poses x 2 arms at worst
 
 

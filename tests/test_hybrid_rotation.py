@@ -12,26 +12,19 @@ from helpers import Rig, assert_clones_are_independent, assert_holds_between_upd
 from robot_facts import ROBOT
 
 from valve_drake.behaviors import hybrid_rotation
-from valve_drake.behaviors.grasp_geometry import hand_in_valve, turned
-from valve_drake.behaviors.hybrid_rotation import (
-    HybridRotation,
-    HybridRotationConfig,
-    Memory,
-    contact_wrench,
-    gravity_wrench,
-    make_chain,
-    turn_rate,
-    twists,
-)
+from valve_drake.behaviors.closed_chain import contact_wrench, gravity_wrench, make_chain, turn_rate, twists
+from valve_drake.behaviors.hybrid_rotation import HybridRotation, Memory
+from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, cross, inverse, make, rot_y, rot_z, rotation, rotation_vector
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, GraspPlan, Mode, ModeState, RobotState, Status
-from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK
+from valve_drake.valve.valve import HandleConfig, Valve, turned
 
 CONFIG = HybridRotationConfig()
-MARKER = Marker()
+VALVE = Valve()
+WIDTH = 0.025  # of both handles [m]
 VIEW = {LEFT: np.array([-0.5, 0, 0.866]), RIGHT: np.array([0.5, 0, 0.866])}
 QUARTER = np.pi / 2
 FACING = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # R_BV of a valve straight ahead
@@ -49,6 +42,8 @@ class Bench:
     spin: moment about the valve's axis beyond which pads spin on the bar [N m].
     bar: the valve's angle at first: level is 0 [rad].
     off: standard error of the plan's position [m], and ten times that of its direction [rad].
+    stuck_on: where a marker that was stuck on by hand makes the plan see the valve, in its place (3, 4).
+    grasp_off: standard error of where the hands hold, along each axis [m].
     noise: of the wrist sensors' forces [N], and a hundredth of it of their torques [N m].
     """
 
@@ -62,21 +57,35 @@ class Bench:
         off: float = 0.002,
         seed: int = 0,
         noise: float = 0.3,
+        valve: Valve = VALVE,
+        stuck_on: np.ndarray | None = None,
+        grasp_off: float = 0.0,
     ):
         self.rng = np.random.default_rng(seed)
-        self.law = HybridRotation(CONFIG, MARKER, ROBOT, VIEW)
+        self.law = HybridRotation(CONFIG, valve, ROBOT, VIEW)
         self.friction, self.travel, self.spin = friction, travel, spin
         self.noise = noise
         self.bias = self.rng.normal(size=(2, 6)) * [0.1, 0.1, 0.1, 2, 2, 2]
-        self.X_BV = make(FACING @ rot_y(0.05) @ rot_z(-bar), np.array([0.66, 0.01, 0.99]))
+        self.X_BA = make(FACING @ rot_y(0.05) @ rot_z(-bar), np.array([0.66, 0.01, 0.99]))
         seen = rotation(self.rng.normal(size=3) * off * 10)
-        plan = make(self.X_BV[:, :3] @ seen, self.X_BV[:, 3] + self.rng.normal(size=3) * off)
-        self.plan = GraspPlan(found=True, X_BV=plan)
+        plan = make(self.X_BA[:, :3] @ seen, self.X_BA[:, 3] + self.rng.normal(size=3) * off)
+        plan = plan if stuck_on is None else compose(plan, stuck_on)
+        # The left hand takes the handle on its side; x_G to the left.
+        level = self.X_BA[1, :3] @ np.array([np.array(handle.xyz) for handle in valve.handles]).T
+        handles = (1, 0) if valve is VALVE else (int(np.argmax(level)), int(np.argmin(level)))
+        sign = [float(np.sign(self.X_BA[1, :3] @ valve.handles[k].direction())) for k in handles]
+        sign = [1.0, -1.0] if valve is VALVE else sign
+        grasps = [valve.grasp(k, s) for k, s in zip(handles, sign)]
+        self.plan = GraspPlan(found=True, X_BA=plan, handle_left=handles[0], handle_right=handles[1])
+        held = plan if stuck_on is None else make(plan[:, :3], self.X_BA[:, 3])  # hands are servoed to the handles
+        true = [compose(self.X_BA, X)[:, 3] + self.rng.normal(size=3) * grasp_off for X in grasps]
         self.angle = 0.0
         self.held: list[np.ndarray | None] = [None, None]  # X_VG of a hand that holds the bar
         self.slips = [False, False]  # a hand whose pads slide carries nothing, though it stays closed
         self.missing = [False, False]  # no bar between the pads of this hand
-        self.X = [compose(plan, hand_in_valve(side, False, MARKER)) for side in SIDES]  # of the hands, true
+        self.X = [compose(held, X) for X in grasps]  # of the hands, true
+        if stuck_on is not None:
+            self.X = [make(X[:, :3], p) for X, p in zip(self.X, true)]
         self.q = [ROBOT.inverse(side, X) for X, side in zip(self.X, SIDES)]  # commanded, as the servos have it
         self.true = list(self.q)
         self.velocity = [np.zeros(6), np.zeros(6)]
@@ -94,16 +103,16 @@ class Bench:
 
         Returns the couple of the forces on the valve, its stiffness, and the moments at the pads before these spin.
         """
-        X_BV, couple, stiffness, moments = turned(self.X_BV, self.angle), 0.0, 0.0, []
-        u = -X_BV[:, 2]
+        X_BA, couple, stiffness, moments = turned(self.X_BA, self.angle), 0.0, 0.0, []
+        u = -X_BA[:, 2]
         for k, Xc in enumerate(wanted):
             holds = self.held[k] is not None and not self.slips[k]
-            X = compose(X_BV, self.held[k]) if holds else Xc
+            X = compose(X_BA, self.held[k]) if holds else Xc
             m = -ANGULAR * rotation_vector(Xc[:, :3] @ X[:, :3].T)
             f = -STIFFNESS * (Xc[:, 3] - X[:, 3])
             over = m @ u - min(max(m @ u, -self.spin), self.spin)
             if holds:
-                r = X[:, 3] - X_BV[:, 3]
+                r = X[:, 3] - X_BA[:, 3]
                 couple -= u @ cross(r, f)
                 stiffness += STIFFNESS * (r @ r - (u @ r) ** 2)
                 moments.append(-float(m @ u))
@@ -130,16 +139,16 @@ class Bench:
             self.springs(wanted)
         for k in range(2):
             if self.held[k] is not None and not self.slips[k]:
-                self.held[k] = compose(inverse(turned(self.X_BV, self.angle)), self.X[k])
+                self.held[k] = compose(inverse(turned(self.X_BA, self.angle)), self.X[k])
 
     def close(self, k: int, wanted: float, force: float) -> None:
         opening = self.gripper[k] + np.clip(wanted - self.gripper[k], -0.15 * TICK, 0.15 * TICK)
         self.pressed[k] = 0.0
-        if opening <= MARKER.handle_width and not self.missing[k]:
-            opening, self.pressed[k] = MARKER.handle_width, force
+        if opening <= WIDTH and not self.missing[k]:
+            opening, self.pressed[k] = WIDTH, force
             if self.held[k] is None:
-                self.held[k] = compose(inverse(turned(self.X_BV, self.angle)), self.X[k])
-        elif opening > MARKER.handle_width + 1e-4:
+                self.held[k] = compose(inverse(turned(self.X_BA, self.angle)), self.X[k])
+        elif opening > WIDTH + 1e-4:
             self.held[k] = None
         self.gripper[k] = opening
 
@@ -189,6 +198,7 @@ class Bench:
         """One activation until it ends (or `limit` seconds) -> its status. each(self) is called every tick."""
         self.activation += 1
         self.rows = []
+        self.plan = dc.replace(self.plan, turn=angle)
         state = ModeState(mode=mode.value, activation=self.activation, turn_angle=angle)
         for _ in range(int(limit / TICK)):
             status = self.tick(state)
@@ -448,7 +458,7 @@ def test_a_grasp_is_closed_tugged_and_relaxed():
     bench.run(Mode.REACH, limit=1.0)
     stages = []
     tug = []
-    u = -bench.X_BV[:, 2]
+    u = -bench.X_BA[:, 2]
 
     def watch(b):
         stages.append(b.memory.stage)
@@ -473,7 +483,7 @@ def test_what_counts_as_held(opening, force, held):
     good = {"left_gripper": 0.025, "right_gripper": 0.025, "left_gripper_force": 70.0, "right_gripper_force": 70.0}
     for side in SIDES:
         state = RobotState(**good | {f"{side}_gripper": opening, f"{side}_gripper_force": force})
-        assert law._held(state) == held
+        assert law._held(Memory(), state) == held
 
 
 @pytest.mark.parametrize("hand", [0, 1])
@@ -625,14 +635,67 @@ def chain_with(f1=(0, 0, 0), f2=(0, 0, 0), m1=(0, 0, 0), m2=(0, 0, 0)):
 
 def test_the_chain_by_hand():
     chain = chain_with(f1=(0, 0, 17), f2=(0, 0, -17))  # a bar that resists being opened
-    assert chain.c.tolist() == [0.6, 0, 0] and chain.L == pytest.approx(0.3)
+    assert chain.c.tolist() == [0.6, 0, 0] and chain.r == pytest.approx([0.15, 0.15])
     assert chain.b.tolist() == [0, -1, 0]
-    assert chain.t == pytest.approx([0, 0, 1])  # u x b: where hand 2 goes when the valve opens
+    assert chain.t == pytest.approx(np.array([[0, 0, -1], [0, 0, 1]]))  # where the hands go when the valve opens
     assert chain.couples == pytest.approx([2.55, 2.55])
     assert chain.torque == pytest.approx(5.1)
     assert chain_with(m1=(0.4, 0, 0)).torque == pytest.approx(0.4)  # by the wrist alone
     deeper = make_chain(np.array([[0.64, 0.15, 0.0], [0.6, -0.15, 0.0]]), np.zeros((2, 6)), np.array([-1.0, 0, 0]))
-    assert deeper.b.tolist() == [0, -1, 0] and deeper.L == pytest.approx(0.3)  # across the axis
+    assert deeper.b.tolist() == [0, -1, 0] and deeper.r == pytest.approx([0.15, 0.15])  # across the axis
+
+
+def test_unequal_radii_drive_with_equal_forces_and_load_the_stem_as_they_must():
+    """Both hands on one side of the axis: with the driving forces felt as they should be, nothing yields."""
+    p = np.array([[0.6, 0.12, 0.0], [0.6, 0.28, 0.0]])  # the left hand nearer to the axis at y = 0
+    u, force = np.array([-1.0, 0, 0]), 5.1 / 0.40
+    felt = np.array([0, 0, 0, 0, 0, force])  # the valve resists: hands that go down are pushed up
+    chain = make_chain(p, np.array([felt, felt]), u, np.array([0.2, 0.0]))
+    assert chain.c == pytest.approx([0.6, 0, 0]) and chain.r == pytest.approx([0.12, 0.28])
+    assert chain.t == pytest.approx(np.array([[0, 0, -1.0], [0, 0, -1.0]]))
+    assert chain.torque == pytest.approx(5.1) and chain.share == pytest.approx(0.3)
+    V = twists(chain, 0.1, CONFIG, np.zeros(6))
+    for k in range(2):
+        assert V[k] == pytest.approx([-0.1, 0, 0, 0, 0, 0], abs=1e-12)  # the turn about the axis, and no more
+    uneven = chain.h.copy()
+    uneven[0, 5] += 10.0  # more than its share: it yields upwards
+    assert twists(dc.replace(chain, h=uneven), 0.1, CONFIG, np.zeros(6))[0][5] > 0
+
+
+LEVER = Valve(model="", handles=[HandleConfig(kind="lever", xyz=[x, 0.0, 0.0]) for x in (-0.12, -0.28)])
+
+
+def test_a_lever_is_turned_with_both_hands_on_one_side_of_the_axis():
+    bench = Bench(valve=LEVER, bar=0.6)
+    bench.run(Mode.REACH, limit=1.0)
+    assert bench.run(Mode.GRASP).state == "succeeded"
+    status = bench.run(Mode.TURN, -0.7)
+    assert status.state == "succeeded", status.detail
+    assert np.degrees(bench.angle + 0.7) == pytest.approx(0, abs=0.5)
+    moving = bench.record()[128:-64]
+    assert moving[:, 5:7].max() < 18  # 12.75 N each
+    assert np.abs(moving[:, 4] - 0.7).max() < 0.1  # the left hand has the longer arm
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_turn_shows_the_axis_that_a_marker_stuck_on_by_hand_hides(seed):
+    """10 mm and 3 deg off: after 20 deg the place is known to 2 mm and the direction to 1 deg."""
+    rng = np.random.default_rng(seed)
+    lean, aside = rng.uniform(0, 2 * np.pi, 2)
+    tilt = np.radians(3) * np.array([np.cos(lean), np.sin(lean), 0.0])
+    stuck_on = make(rotation(tilt), 0.010 * np.array([np.cos(aside), np.sin(aside), 0.0]))
+    bench = Bench(seed=seed, off=0.0, stuck_on=stuck_on, grasp_off=0.0015, spin=100.0)
+    bench.run(Mode.REACH, limit=1.0)
+    assert bench.run(Mode.GRASP).state == "succeeded"
+    u, c = -bench.X_BA[:, 2], bench.X_BA[:, 3]
+    assert np.degrees(np.arccos(u @ bench.memory.u)) == pytest.approx(3.0, abs=0.01)
+    assert bench.run(Mode.TURN, np.radians(20)).state == "succeeded"
+    off = bench.memory.telemetry.center - c
+    assert np.degrees(np.arccos(u @ bench.memory.telemetry.axis)) < 1.0
+    assert np.linalg.norm(off - u * (u @ off)) < 0.002
+    assert bench.record()[:, 5:7].max() < 35
+    bench.run(Mode.TURN, np.radians(70))
+    assert np.degrees(bench.angle) == pytest.approx(90, abs=0.3)
 
 
 def test_telemetry_by_hand():
@@ -731,7 +794,7 @@ def test_the_same_inputs_give_the_same_bits():
 )
 def test_bad_config_is_refused_by_name(changes):
     with pytest.raises(ConfigError, match=f"hybrid_rotation.{next(iter(changes))}"):
-        HybridRotation(dc.replace(CONFIG, **changes), MARKER, ROBOT, VIEW)
+        HybridRotation(dc.replace(CONFIG, **changes), VALVE, ROBOT, VIEW)
 
 
 def rig(**inputs) -> Rig:

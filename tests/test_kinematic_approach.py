@@ -15,10 +15,7 @@ from valve_drake.behaviors import stance_planner
 from valve_drake.behaviors.grasp_geometry import (
     StanceConfig,
     Stances,
-    angle_turned,
-    hand_in_valve,
     standoff,
-    turned,
 )
 from valve_drake.behaviors.kinematic_approach import (
     NOT_OWNED,
@@ -50,7 +47,6 @@ from valve_drake.messages import (
     Status,
     TurnState,
 )
-from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK
 from valve_drake.robot import description
 from valve_drake.robot.kinematics import OUTWARD
@@ -59,40 +55,39 @@ from valve_drake.robot_state_system import HISTORY
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
 from valve_drake.supervisor.supervisor import SupervisorConfig
+from valve_drake.valve.valve import Valve, angle_turned, turned
 
 CONFIG = KinematicApproachConfig()
 PLANNER = StancePlannerConfig()
 PORTION = round(PERIOD / TICK)  # ticks between two portions of a search
 STANCE = StanceConfig(distance_min=0.70, distance_max=0.78)  # fewer places to try: quicker
-MARKER = Marker()
+VALVE = Valve()
 TAUGHT = load_taught(resources.models() / "taught" / "hands.yaml")
 VIEW = {side: TAUGHT[side].view for side in SIDES}
 AREA = {side: TAUGHT[side].area for side in SIDES}
 QUARTER = np.pi / 2
 IMAGE = 16  # ticks between estimates
-X_OV = compose(
-    planar(1.5, -0.4, 0.2), panel_pose(ValveConfig(height=1.0)), make(np.eye(3), np.array([0, 0, -MARKER.panel_depth]))
-)
+X_OA = compose(planar(1.5, -0.4, 0.2), panel_pose(ValveConfig(height=1.0)), inverse(VALVE.X_AP()))
 
 
 @pytest.fixture(scope="module")
 def collision():
-    return CollisionModel(ROBOT, MARKER)
+    return CollisionModel(ROBOT)
 
 
 @pytest.fixture(scope="module")
 def base():
-    return Stances(ROBOT, MARKER, STANCE, VIEW, lambda *_: True).find(X_OV, QUARTER)[0].base
+    return Stances(ROBOT, VALVE, STANCE, VIEW, lambda *_: True).find(X_OA, QUARTER)[0].base
 
 
 class Bench:
     """Arms that follow at once, a head camera that sees the marker with some noise 8 times a second."""
 
     def __init__(self, base: np.ndarray, is_free=lambda *_: True, *, arms: np.ndarray = HOME, config=CONFIG):
-        self.law = KinematicApproach(config, ROBOT, AREA)
-        self.planner = StancePlanner(PLANNER, Stances(ROBOT, MARKER, STANCE, VIEW, is_free))
+        self.law = KinematicApproach(config, ROBOT, VALVE, AREA)
+        self.planner = StancePlanner(PLANNER, Stances(ROBOT, VALVE, STANCE, VIEW, is_free))
         self.planned = stance_planner.Memory()
-        self.base, self.X_OV, self.axis_known = base, X_OV, True
+        self.base, self.X_OA, self.axis_known = base, X_OA, True
         self.rng = np.random.default_rng(0)
         self.noise = np.array([0.002] * 3 + [0.001] * 3)  # of an estimate [rad, m]
         self.arms, self.torso = arms.copy(), np.array([0.0, 0.3, 0.0])
@@ -105,7 +100,7 @@ class Bench:
 
     def look(self) -> RectangleEstimate:
         X_OL = ROBOT.head_pose(self.base, self.torso)
-        X_LV = compose(inverse(X_OL), self.X_OV)
+        X_LV = compose(inverse(X_OL), self.X_OA, VALVE.X_AV())
         e = self.rng.normal(size=6) * self.noise
         return RectangleEstimate(
             time=self.time,
@@ -226,7 +221,7 @@ def test_the_stance_is_renewed_from_the_latest_looks():
     bench.run(Mode.FINE_APPROACH, limit=3 * PLANNER.period + 0.2, each=lambda b: seen.append(b.planned.stance))
     times = sorted({s.time for s in seen if s.found})
     assert np.diff(times) == pytest.approx([PLANNER.period] * 3, abs=1.1 * IMAGE * TICK)
-    bench.X_OV = make(X_OV[:, :3], X_OV[:, 3] + [0.10, 0, 0])  # the odometry has slipped
+    bench.X_OA = make(X_OA[:, :3], X_OA[:, 3] + [0.10, 0, 0])  # the odometry has slipped
     before = bench.planned.stance.base
     bench.run(Mode.FINE_APPROACH, limit=3.2 * PLANNER.period)
     assert bench.planned.stance.base - before == pytest.approx([0.10, 0, 0], abs=0.03)
@@ -234,8 +229,8 @@ def test_the_stance_is_renewed_from_the_latest_looks():
 
 def test_a_valve_out_of_reach_has_no_stance_and_says_so():
     bench = Bench(np.array([0.1, -0.2, 0.1]))
-    bench.X_OV = make(X_OV[:, :3], X_OV[:, 3] + [0, 0, 0.8])
-    bench.run(Mode.FINE_APPROACH, limit=0.2)
+    bench.X_OA = make(X_OA[:, :3], X_OA[:, 3] + [0, 0, 0.8])
+    bench.run(Mode.FINE_APPROACH, limit=0.5)
     assert not bench.planned.stance.found
     assert "no stance" in bench.planned.stance.reason and "margin" in bench.planned.stance.reason
 
@@ -263,13 +258,14 @@ def test_measuring_at_rest_gives_the_valve_and_the_grasps(base):
     status = bench.run(Mode.MEASURE)
     assert status.state == "succeeded" and status.activation == 1
     plan = bench.memory.plan
-    X_BV = compose(inverse(planar(*base)), X_OV)
+    X_BA = compose(inverse(planar(*base)), X_OA)
     assert plan.found and plan.margin > 0.5
-    assert plan.X_BV[:, 3] == pytest.approx(X_BV[:, 3], abs=0.0015)  # the mean of six is better than one
-    assert np.linalg.norm(rotation_vector(plan.X_BV[:, :3].T @ X_BV[:, :3])) < 0.004
+    assert plan.X_BA[:, 3] == pytest.approx(X_BA[:, 3], abs=0.0015)  # the mean of six is better than one
+    assert np.linalg.norm(rotation_vector(plan.X_BA[:, :3].T @ X_BA[:, :3])) < 0.004
     for side in SIDES:
-        X_VG = compose(inverse(plan.X_BV), getattr(plan, f"X_BG_{side}"))
-        assert X_VG == pytest.approx(hand_in_valve(side, plan.swapped, MARKER))
+        X_AG = compose(inverse(plan.X_BA), getattr(plan, f"X_BG_{side}"))
+        handle = getattr(plan, f"handle_{side}")
+        assert any(X_AG == pytest.approx(VALVE.grasp(handle, sign)) for sign in (1.0, -1.0))
     assert np.trace(plan.covariance[3:, 3:]) < 3e-6
     taken = CONFIG.settle + CONFIG.frames * IMAGE * TICK
     assert bench.time - start == pytest.approx(taken, abs=2 * IMAGE * TICK)
@@ -278,17 +274,17 @@ def test_measuring_at_rest_gives_the_valve_and_the_grasps(base):
 def test_only_images_taken_at_rest_count(base):
     """What was captured before the robot had settled is an image of another place."""
     bench = Bench(base)
-    wrong = make(X_OV[:, :3], X_OV[:, 3] + [0.05, 0, 0])
-    bench.X_OV = wrong
+    wrong = make(X_OA[:, :3], X_OA[:, 3] + [0.05, 0, 0])
+    bench.X_OA = wrong
 
     def settle(b):
         if b.time >= 5.0 + CONFIG.settle:
-            b.X_OV = X_OV
+            b.X_OA = X_OA
 
     assert bench.run(Mode.MEASURE, each=settle).state == "succeeded"
     assert len(bench.memory.looks) == CONFIG.frames
     assert all(look.time >= 5.0 + CONFIG.settle for look in bench.memory.looks)
-    assert compose(planar(*base), bench.memory.plan.X_BV)[:, 3] == pytest.approx(X_OV[:, 3], abs=0.0015)
+    assert compose(planar(*base), bench.memory.plan.X_BA)[:, 3] == pytest.approx(X_OA[:, 3], abs=0.0015)
 
 
 def test_each_image_counts_once(base):
@@ -343,14 +339,14 @@ def test_reaching_goes_free_and_smooth_to_the_standoff_and_rests_there(base, col
     assert status.state == "succeeded", status.detail
     assert status.detail == "at the stand-off"
     plan = bench.memory.plan
-    X_BV = compose(inverse(planar(*base)), X_OV)
+    X_BA = compose(inverse(planar(*base)), X_OA)
     for k, side in enumerate(SIDES):
         X_BG = ROBOT.forward(side, bench.arms[6 * k : 6 * k + 6])
         goal = standoff(getattr(plan, f"X_BG_{side}"), VIEW[side], STANCE.standoff)
         assert X_BG == pytest.approx(goal, abs=1e-6)
     assert_smooth([start, *bench.commands])
     for q in bench.commands[::4]:
-        assert collision.is_free(X_BV, q), collision.touching(X_BV, q)
+        assert collision.is_free(X_BA, q), collision.touching(X_BA, q)
     rest = np.array(bench.commands[-int(CONFIG.rest / TICK) :])
     assert np.ptp(rest, axis=0).max() == 0  # the wrist sensors are tared in this time
 
@@ -385,7 +381,7 @@ def test_one_large_mark_is_not_enough(base, left, right):
 def test_a_blocked_standoff_fails_with_a_verdict_and_the_arms_stay(base):
     bench = Bench(base).measured()
     bench.planner.stances = dc.replace(
-        bench.planner.stances, is_free=lambda X_BV, q, _=None: bool(np.max(np.abs(q - HOME)) < 0.2)
+        bench.planner.stances, is_free=lambda X_BA, q, _=None: bool(np.max(np.abs(q - HOME)) < 0.2)
     )
     status = bench.run(Mode.REACH)
     assert (status.state, status.verdict) == ("failed", "reach_limit")
@@ -398,7 +394,7 @@ def test_a_way_round_an_obstacle_stays_within_the_joint_limits(base, detour):
     """The shortest way round leads through angles that the elbow does not have."""
     goal = []
 
-    def is_free(X_BV, q, _=None):
+    def is_free(X_BA, q, _=None):
         share = (q[0] - HOME[0]) / (goal[0][0] - HOME[0]) if goal else 0.0
         return not 0.35 < share < 0.65 or bool(q[2] < HOME[2] - detour)  # J3 is -1.9 at home; its limit is -2.62
 
@@ -416,7 +412,7 @@ def test_a_way_round_an_obstacle_stays_within_the_joint_limits(base, detour):
 def verify(base, true: float, hands: float, commanded: float = QUARTER, *, is_free=lambda *_: True, known=True):
     bench = Bench(base, is_free).at_standoff()
     bench.turn = TurnState(angle=hands)
-    bench.X_OV = turned(X_OV, true)
+    bench.X_OA = turned(X_OA, true)
     bench.axis_known = known
     bench.folded = bench.run(Mode.FOLD, turn_angle=commanded)
     bench.folding = bench.commands
@@ -427,9 +423,9 @@ def test_fold_brings_the_arms_home_free_and_smooth_and_verify_looks_with_the_arm
     bench, status = verify(base, QUARTER, 1.56, is_free=collision.is_free)
     assert bench.folded.state == status.state == "succeeded"
     assert_smooth(bench.folding)
-    X_BV = turned(compose(inverse(planar(*base)), X_OV), 1.56)
+    X_BA = turned(compose(inverse(planar(*base)), X_OA), 1.56)
     for q in bench.folding[::4]:
-        assert collision.is_free(X_BV, q)
+        assert collision.is_free(X_BA, q)
     assert np.array(bench.commands) == pytest.approx(np.tile(HOME, (len(bench.commands), 1)))
     began = bench.time - TICK * len(bench.commands)
     assert all(look.time > began + CONFIG.settle - 2 * TICK for look in bench.memory.looks)
@@ -460,32 +456,32 @@ def test_a_rectangle_that_looks_alike_after_part_of_a_turn_is_counted_by_the_han
     """Green marks repeat every half turn, the rectangle alone every quarter."""
     for true in (0.0, QUARTER, np.pi, 1.5 * np.pi):
         bench = Bench(base)
-        seen = bench.law.seen_angle(X_OV, turned(X_OV, true if known else 0.0), known, true + 0.1)
+        seen = bench.law.seen_angle(X_OA, turned(X_OA, true if known else 0.0), known, true + 0.1)
         assert seen == pytest.approx(true, abs=1e-9)
-    assert bench.law.seen_angle(X_OV, turned(X_OV, 0.2 + np.pi), True, 0.1) == pytest.approx(0.2)
+    assert bench.law.seen_angle(X_OA, turned(X_OA, 0.2 + np.pi), True, 0.1) == pytest.approx(0.2)
 
 
 def test_the_way_home_keeps_clear_of_the_valve_as_the_hands_left_it(base):
     asked = []
-    bench, _ = verify(base, 0.6, 0.58, 0.6, is_free=lambda X_BV, q, _=None: not asked.append(X_BV))
-    assert angle_turned(bench.memory.plan.X_BV, asked[-1]) == pytest.approx(0.58)
-    assert angle_turned(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.0)  # on the way there
+    bench, _ = verify(base, 0.6, 0.58, 0.6, is_free=lambda X_BA, q, _=None: not asked.append(X_BA))
+    assert angle_turned(bench.memory.plan.X_BA, asked[-1]) == pytest.approx(0.58)
+    assert angle_turned(bench.memory.plan.X_BA, asked[0]) == pytest.approx(0.0)  # on the way there
 
 
 @pytest.mark.parametrize("mode", [Mode.RETREAT, Mode.IDLE, Mode.SEARCH])
 def test_an_early_retreat_or_a_reset_at_the_valve_keeps_clear_of_it_too(base, mode):
     asked = []
-    bench = Bench(base, lambda X_BV, q, _=None: not asked.append(X_BV)).at_standoff()
+    bench = Bench(base, lambda X_BA, q, _=None: not asked.append(X_BA)).at_standoff()
     bench.turn = TurnState(angle=0.4)
     bench.run(Mode.STOPPED, limit=0.1)
     asked.clear()
     bench.run(mode, limit=0.1)
-    assert angle_turned(bench.memory.plan.X_BV, asked[0]) == pytest.approx(0.4)
+    assert angle_turned(bench.memory.plan.X_BA, asked[0]) == pytest.approx(0.4)
     bench.run(Mode.STOPPED, limit=0.1)
     bench.base = bench.base - [1.5 * np.cos(bench.base[2]), 1.5 * np.sin(bench.base[2]), 0]  # away from it
     asked.clear()
     bench.run(mode, limit=0.1)
-    assert asked and all(X_BV is None for X_BV in asked)  # far from any valve
+    assert asked and all(X_BA is None for X_BA in asked)  # far from any valve
 
 
 @pytest.mark.parametrize("homewards", [True, False])
@@ -503,7 +499,7 @@ def test_where_the_straight_line_is_blocked_the_hands_move_straight_back_from_th
             assert moved == pytest.approx([0, OUTWARD[side] * back / 2, 0], abs=2e-6)  # and a little outwards
             assert X1[:, :3] == pytest.approx(X0[:, :3], abs=2e-6)
     middle = (start + goal) / 2
-    free = lambda X_BV, q, _=None: bool(np.abs(q - middle).max() > 0.08)  # noqa: E731
+    free = lambda X_BA, q, _=None: bool(np.abs(q - middle).max() > 0.08)  # noqa: E731
     bench.planner.stances = dc.replace(bench.planner.stances, is_free=free)
     bench.run(Mode.IDLE, limit=0.1)
     bench.memory = dc.replace(bench.memory, q=start, path=None)
@@ -513,7 +509,7 @@ def test_where_the_straight_line_is_blocked_the_hands_move_straight_back_from_th
 
 def test_no_way_home_fails_with_a_verdict(base):
     free = [True]
-    bench = Bench(base, lambda X_BV, q, _=None: free[0]).at_standoff()
+    bench = Bench(base, lambda X_BA, q, _=None: free[0]).at_standoff()
     free[0] = False
     status = bench.run(Mode.FOLD)
     assert (status.state, status.verdict) == ("failed", "reach_limit")
@@ -522,7 +518,7 @@ def test_no_way_home_fails_with_a_verdict(base):
 
 def turning(bench: Bench, rate: Callable[[float], float]) -> None:
     """The valve turns on by itself: rate(time) [rad/s]."""
-    bench.X_OV = turned(bench.X_OV, rate(bench.time) * TICK)
+    bench.X_OA = turned(bench.X_OA, rate(bench.time) * TICK)
 
 
 def test_a_marker_that_is_not_seen_again_ends_unverified_with_what_the_hands_know(base):
@@ -542,10 +538,10 @@ def test_a_valve_that_turns_on_after_the_hands_let_go_is_not_turned(base):
     """It would be within the tolerance at the moment of the first looks, and is not when the run has ended."""
     bench = Bench(base).at_standoff()
     bench.noise = bench.noise / 10  # as near the valve
-    bench.turn, bench.X_OV = TurnState(angle=QUARTER), turned(X_OV, QUARTER)
+    bench.turn, bench.X_OA = TurnState(angle=QUARTER), turned(X_OA, QUARTER)
     status = bench.run(Mode.VERIFY, limit=30.0, each=lambda b: turning(b, lambda t: -np.radians(0.3)))
     assert (status.state, status.verdict) == ("failed", "unverified")
-    assert status.value == pytest.approx(angle_turned(X_OV, bench.X_OV), abs=0.005)
+    assert status.value == pytest.approx(angle_turned(X_OA, bench.X_OA), abs=0.005)
     assert re.search(r"turning by -0\.(29|3\d) deg/s", status.detail)
     assert "hands turned 90.00 deg of 90.00 deg" in status.detail
 
@@ -554,7 +550,7 @@ def test_a_valve_that_turns_on_after_the_hands_let_go_is_not_turned(base):
 def test_verify_waits_for_a_valve_that_comes_to_rest_and_judges_it_there(base, rest, state):
     bench = Bench(base).at_standoff()
     bench.noise = bench.noise / 10
-    bench.turn, bench.X_OV = TurnState(angle=QUARTER), turned(X_OV, QUARTER)
+    bench.turn, bench.X_OA = TurnState(angle=QUARTER), turned(X_OA, QUARTER)
     still = bench.time + 5.0
     status = bench.run(Mode.VERIFY, each=lambda b: turning(b, lambda t: -rest / 5.0 if t < still else 0.0))
     assert status.state == state
@@ -693,16 +689,17 @@ def test_arms_wait_for_their_path_and_hold_still(base):
 
 def test_the_lift_is_chosen_where_the_arms_alone_do_not_reach(tmp_path):
     lifted = Robot.load(description.find("pr2/pr2.robot.yaml"))
-    stances = Stances(lifted, MARKER, STANCE, VIEW, lambda *_: True)
-    places = stances.begin(X_OV, QUARTER).places
-    assert len(places) == 2 and all(place.posture is None for place in places[0])
+    stances = Stances(lifted, VALVE, STANCE, VIEW, lambda *_: True)
+    places = stances.begin(X_OA, QUARTER, np.zeros(2)).places
+    assert len(places) == 3 and all(place.posture is None for place in places[0])
     heights = sorted({float(place.posture[0]) for place in places[1]})
     low, high = lifted.posture.low[0], lifted.posture.high[0]
     assert heights[-1] == pytest.approx(high) and np.diff(heights).max() <= STANCE.lift_step + 1e-9
     assert lifted.posture.home[0] == pytest.approx(low) or heights[0] == pytest.approx(low)
     raised = places[1][-1].posture
-    X_BV = compose(inverse(planar(*places[0][0].base)), X_OV)
-    low_arc = stances.check_arc(X_BV, 0.3, False)
-    up = make(X_BV[:, :3], X_BV[:, 3] + [0, 0, raised[0] - lifted.posture.home[0]])
-    high_arc = stances.check_arc(up, 0.3, False, posture=raised)
+    X_BA = compose(inverse(planar(*places[0][0].base)), X_OA)
+    grasps = next(stances.pairs(X_BA, 0.3))[0]
+    low_arc = stances.check_arc(X_BA, 0.3, grasps)
+    up = make(X_BA[:, :3], X_BA[:, 3] + [0, 0, raised[0] - lifted.posture.home[0]])
+    high_arc = stances.check_arc(up, 0.3, grasps, posture=raised)
     assert high_arc.margin == pytest.approx(low_arc.margin, abs=1e-3)  # the valve and the shoulders are as high

@@ -18,7 +18,6 @@ from robot_facts import GROUPS, ROBOT, robot_state
 from valve_drake import frames, profiling, resources
 from valve_drake import messages as ms
 from valve_drake.camera.lens import load_head
-from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK
 from valve_drake.recording import foxglove
 from valve_drake.recording.layout import PLOTS, VISIBLE_3D, layout
@@ -303,23 +302,23 @@ def test_frames_poses_and_calibrations(log):
 
 
 def test_the_wheel_turns_with_the_marker_and_the_panel_stays():
-    marker = Marker()
-    belief = RobotFrames(ROBOT, load_head(resources.models() / "calibration" / "head.yaml"), marker)
-    X_BV = frames.make(frames.rot_y(0.2), np.array([0.6, 0.1, 1.2]))
+    depth = 0.131  # of the panel's surface behind the marker [m]
+    belief = RobotFrames(ROBOT, load_head(resources.models() / "calibration" / "head.yaml"))
+    X_BA = frames.make(frames.rot_y(0.2), np.array([0.6, 0.1, 1.2]))
     found = {}
     for angle in (0.0, 0.7):
-        plan, turn = ms.GraspPlan(found=True, X_BV=X_BV), ms.TurnState(angle=angle)
+        plan, turn = ms.GraspPlan(found=True, X_BA=X_BA), ms.TurnState(angle=angle)
         tree = belief(robot_state(), ms.RectangleEstimate(), plan, turn)
         found[angle] = {child: (parent, X) for parent, child, X in tree}
     (odometry, start), (_, end) = (found[angle]["marker"] for angle in (0.0, 0.7))
     np.testing.assert_allclose(start[:, :3].T @ end[:, :3], frames.rot_z(-0.7), atol=1e-12)
     for angle in found:
         parent, X = found[angle]["valve::wheel"]
-        assert parent == "marker" and X[:, 3].tolist() == [0, 0, marker.panel_depth]
+        assert parent == "marker" and X[:, 3] == pytest.approx([0, 0, depth])
         parent, X = found[angle]["valve::panel"]
         assert parent == odometry
         np.testing.assert_allclose(X[:, :3], start[:, :3], atol=1e-12)
-        np.testing.assert_allclose(X[:, 3] - start[:, 3], marker.panel_depth * start[:, 2], atol=1e-12)
+        np.testing.assert_allclose(X[:, 3] - start[:, 3], depth * start[:, 2], atol=1e-12)
 
 
 def test_truth_may_be_cut_without_a_trace_on_other_topics(log, tmp_path):

@@ -87,7 +87,7 @@ def test_edges_that_determine_no_pose_are_refused():
         (facing(0.2, 0.2), MARKER, "distance"),
         (facing(7.0, 0.2), MARKER, "distance"),
         (facing(1.0, np.radians(80)), MARKER, "tilt"),
-        (facing(1.0, 0.2), Marker(size=[0.2, 0.2], handle_radius=0.3), "size|residual"),
+        (facing(1.0, 0.2), Marker.of([0.2, 0.2], 0.3), "size|residual"),
     ],
 )
 def test_implausible_pose_is_refused(X, marker, says):

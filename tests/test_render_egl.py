@@ -48,7 +48,7 @@ def rig(renderer: str) -> CameraRig:
     sc = scenario.resolve(scenario.load(None, ["seed=5", *(f"simulation.camera.{k}={v}" for k, v in keys.items())]))
     head = load_head(named_files.find(sc, "head_calibration"))
     mounts, simulation = make_mounts(head, sc.simulation, 5, ROBOT.description.cameras), sc.simulation
-    return CameraRig(mounts, simulation.valve, tuple(sc.marker.size), simulation.light, simulation.camera, 5)
+    return CameraRig(mounts, simulation.valve, sc.valve, simulation.light, simulation.camera, 5)
 
 
 @pytest.fixture(scope="module")

@@ -284,7 +284,7 @@ def test_the_3d_view_takes_the_next_free_port_and_says_which(here, capsys):
         (["run", "--set", f"taught={'a' * 5000}"], "no such file: "),
         (["run", "--set", "valve.height=1"], "unknown key valve"),
         (["run", "--set", "simulation.valve.height=nan"], "finite number"),
-        (["run", "--set", "marker.size=[0.3, 0.3]"], "panel"),
+        (["run", "--set", "valve.marker.size=[0.3, 0.3]"], "face"),
         (["run", "--seed", "x"], "--seed"),
         (["run", "--duration", "nan"], "--duration"),
         (["run", "--command", "push"], "push"),

@@ -55,10 +55,10 @@ def test_close_starts_open_and_an_explicit_position_stays():
         ("simulation.valve.height=!Uniform {max: 1.2}", ["simulation.valve.height", "{min: a, max: b}", "1.2"]),
         ("simulation.valve.height=!Uniform 1.2", ["simulation.valve.height", "{min: a, max: b}", "1.2"]),
         ("simulation.valve.height=!Uniform {min: 1, max: 1.2, mean: 1}", ["unknown key simulation.valve.height.mean"]),
-        ("marker.size=[0.2, 0.1]", ["marker.size", "panel", "0.2"]),
-        ("marker.size=[0.1]", ["marker.size", "2 values"]),
-        ("marker.size=0.1", ["marker.size", "list"]),
-        ("marker=3", ["marker", "group of keys"]),
+        ("valve.marker.size=[0.2, 0.1]", ["valve.marker.size", "face", "0.2"]),
+        ("valve.marker.size=[0.1]", ["valve.marker.size", "2 values"]),
+        ("valve.marker.size=0.1", ["valve.marker.size", "list"]),
+        ("valve=3", ["valve", "group of keys"]),
         ("command=push", ["command", "open or close", "push"]),
         ("seed=1.5", ["seed", "whole number", "1.5"]),
         ("seed=-1", ["seed", "-1"]),
@@ -99,9 +99,9 @@ def test_a_name_that_no_scenario_has_gives_one_short_line(name):
 
 def test_loading_twice_shares_nothing():
     a, b = mut.load(), mut.load()
-    a.marker.size[0] = 0.05
+    a.valve.marker.size[0] = 0.05
     a.supervisor.deadline["search"] = 1.0
-    assert b.marker.size[0] == 0.098 and b.supervisor.deadline["search"] == 60.0
+    assert b.valve.marker.size[0] == 0.098 and b.supervisor.deadline["search"] == 60.0
 
 
 @pytest.mark.parametrize("old, new", mut.former_names().items())

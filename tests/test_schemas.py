@@ -79,8 +79,8 @@ def test_empty_rows_keep_their_width():
 
 def test_matrices_are_row_major():
     X = np.arange(12.0).reshape(3, 4)
-    proto = schemas.proto_class(ms.GraspPlan).FromString(schemas.encode(ms.GraspPlan(X_BV=X)))
-    assert list(proto.X_BV) == list(range(12))
+    proto = schemas.proto_class(ms.GraspPlan).FromString(schemas.encode(ms.GraspPlan(X_BA=X)))
+    assert list(proto.X_BA) == list(range(12))
 
 
 def test_pixels_and_jpeg_stay_out_of_messages():

@@ -219,7 +219,7 @@ def test_a_rendered_marker_lies_where_the_lens_says_to_a_twentieth_of_a_pixel(ca
     X_WC = X_WL if side == "left" else compose(X_WL, head.X_LR)
     X_CV = compose(inverse(X_WC), rig.read("truth.marker_pose").reshape(3, 4))
     lens = getattr(head, side)
-    w, h = rig.scenario.marker.size
+    w, h = rig.scenario.valve.marker.size
     corners = apply(X_CV, np.array([[-w, -h, 0], [w, -h, 0], [w, h, 0], [-w, h, 0]]) / 2)
     true = corners[:, :2] / corners[:, 2:] * lens.k_x  # without the lens's distortion, in which sides are straight
     fitted = meet(side_lines(lens.normalize(quad.points) * lens.k_x, quad.side)[0])

@@ -37,7 +37,7 @@ def test_the_shipped_references_are_current(taught):
         scale = np.abs(shipped[side].jacobian).max(axis=1, keepdims=True)
         assert np.abs((taught[side].jacobian - shipped[side].jacobian) / scale).max() < 0.05
     scenario = scenarios.load()
-    assert teaching.made_for(robot_of(scenario), scenario.marker) == load_made_for(SHIPPED)
+    assert teaching.made_for(robot_of(scenario), scenario.valve) == load_made_for(SHIPPED)
 
 
 def test_the_view_direction_learned_from_images_is_the_cameras(taught):
@@ -131,7 +131,7 @@ def moved_camera(model):
 CHANGES = {
     "opening": (lambda folder: changed(folder, opening=0.08), [], "an opening of 85 mm, not 80 mm"),
     "robot": (lambda folder: variant(folder, moved_camera), [], "another robot"),
-    "marker": (variant, ["marker.handle_radius=0.16"], "another marker"),
+    "marker": (variant, ["valve.marker.mark_height=0.012"], "another marker"),
     "nothing": (lambda folder: changed(folder, taught=""), [], "robot.yaml names no taught references"),
 }
 

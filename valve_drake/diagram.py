@@ -31,7 +31,7 @@ from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError, require
 from valve_drake.collision import CollisionModel
-from valve_drake.frames import compose, inverse, make, planar, rot_z
+from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import SIDES, OperatorCommand, OperatorPackets
 from valve_drake.operator.operator_channel_system import OperatorChannelSystem
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
@@ -58,6 +58,7 @@ from valve_drake.stations.simulation_config import StartConfig
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
 from valve_drake.supervisor.supervisor_system import SupervisorSystem
 from valve_drake.task.modes import BEHAVIORS
+from valve_drake.valve.valve import turned
 
 MEASURED = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and not isinstance(spec.kind, type))
 
@@ -153,7 +154,7 @@ class System:
 
 def robot_of(scenario: Scenario) -> Robot:
     """The robot of a scenario. Raises ConfigError if there is none, or the program cannot use it."""
-    robot = Robot.load(named_files.find(scenario, "robot"))
+    robot = Robot.load(named_files.find(scenario, "robot"), scenario.valve)
     d = robot.description
     try:
         require(d.servo == "camera", "servo", "camera (another way is not supported yet)", d.servo)
@@ -161,10 +162,10 @@ def robot_of(scenario: Scenario) -> Robot:
             require(bool(getattr(d.gaze, key)), f"gaze.{key}", "given: the search turns the eyes by it", "")
         require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
         _check_gaze(scenario.valve_search, robot)
-        high, width = scenario.command_selector.gripper_high, scenario.marker.handle_width
+        high, width = scenario.command_selector.gripper_high, max(h.width for h in scenario.valve.handles)
         require(d.opening <= high, "opening", f"at most command_selector.gripper_high, {high:g}", d.opening)
         least = width + 2 * scenario.hybrid_rotation.grip_margin
-        require(d.opening >= least, "opening", f"at least {least:g}: marker.handle_width and room", d.opening)
+        require(d.opening >= least, "opening", f"at least {least:g}: valve.handles.width and room", d.opening)
     except ConfigError as error:
         raise ConfigError(f"{scenario.robot}: {error}") from error
     return robot
@@ -193,17 +194,16 @@ def _check_gaze(search: ValveSearchConfig, robot: Robot) -> None:
 
 def start_of(scenario: Scenario) -> RobotStart | None:
     """How the simulated robot of a resolved scenario begins; None: at home. Raises ConfigError if it cannot."""
-    simulation, marker, robot = scenario.simulation, scenario.marker, robot_of(scenario)
+    simulation, valve, robot = scenario.simulation, scenario.valve, robot_of(scenario)
     start: StartConfig = simulation.start
     if not start.at_valve:
         return None
-    X_WP = panel_pose(simulation.valve)
-    bar = rot_z(-simulation.valve.bar_angle - max(simulation.valve.position, 0.0))
-    X_WV = compose(X_WP, make(bar, np.zeros(3)), make(np.eye(3), np.array([0, 0, -marker.panel_depth])))
+    opened = simulation.valve.bar_angle + valve.sense * max(simulation.valve.position, 0.0)
+    X_WA = turned(compose(panel_pose(simulation.valve), inverse(valve.X_AP())), opened)
     along = dict.fromkeys(SIDES, np.array([0.0, 0.0, 1.0]))  # how the wrist cameras look is not known without a lesson
-    stances = Stances(robot, marker, scenario.stance, along, CollisionModel(robot, marker).is_free)
-    place, margin = stances.find(X_WV, scenario.angle)
-    arc = stances.best_arc(compose(inverse(planar(*place.base)), X_WV), scenario.angle, posture=place.posture)
+    stances = Stances(robot, valve, scenario.stance, along, CollisionModel(robot).is_free)
+    place, margin = stances.find(X_WA, scenario.angle)
+    arc = stances.best_arc(compose(inverse(planar(*place.base)), X_WA), scenario.angle, posture=place.posture)
     if margin < 0 or not arc.q:
         raise ConfigError(f"the hands do not reach the handles of a valve at {simulation.valve.height:g} m")
     torso = robot.torso.home.copy()
@@ -246,7 +246,7 @@ def make_station(
     robot = robot_of(scenario)
     return make_simulated_station(
         scenario.simulation,
-        (scenario.marker.size[0], scenario.marker.size[1]),
+        scenario.valve,
         _head(scenario),
         robot,
         scenario.seed,
@@ -258,14 +258,14 @@ def make_station(
 
 def plant_of(scenario: Scenario) -> PlantSystem:
     """The plant of a resolved scenario of station `simulated`."""
-    size = (scenario.marker.size[0], scenario.marker.size[1])
-    return make_plant(scenario.simulation, size, robot_of(scenario), scenario.seed, start_of(scenario))
+    return make_plant(scenario.simulation, scenario.valve, robot_of(scenario), scenario.seed, start_of(scenario))
 
 
 def rig_of(scenario: Scenario) -> tuple[Any, ...]:
     """The simulated cameras of a resolved scenario, as the arguments of CameraRig or CameraWorkers."""
-    size = (scenario.marker.size[0], scenario.marker.size[1])
-    return rig_arguments(scenario.simulation, size, _head(scenario), scenario.seed, robot_of(scenario).description)
+    return rig_arguments(
+        scenario.simulation, scenario.valve, _head(scenario), scenario.seed, robot_of(scenario).description
+    )
 
 
 def _head(scenario: Scenario) -> StereoHead:
@@ -276,15 +276,15 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     """All blocks between the station's outputs and its inputs: the same objects for every station."""
     head = _head(scenario)
     taught = load_taught(named_files.find(scenario, "taught"))
-    marker = scenario.marker
+    valve, marker = scenario.valve, scenario.valve.target()
     view = {side: taught[side].view for side in SIDES}
     area = {side: taught[side].area for side in SIDES}
     X_LEyes = make(np.eye(3), head.X_LR[:, 3] / 2)  # between both head cameras: a near marker stays in both images
     robot = robot_of(scenario)
-    collision = CollisionModel(robot, marker)
+    collision = CollisionModel(robot)
     if touching := collision.touching(None, robot.home):
         raise ConfigError(f"{scenario.robot}: arms.left.home and arms.right.home must be free of all: {touching[0]}")
-    stances = Stances(robot, marker, scenario.stance, view, collision.is_free)
+    stances = Stances(robot, valve, scenario.stance, view, collision.is_free)
     return [
         RobotStateSystem(robot.groups),
         ColorSegmentationSystem(scenario.color_segmentation),
@@ -299,11 +299,11 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             robot.waist,
             robot.gaze_signs,
         ),
-        BaseApproachSystem(scenario.base_approach, marker),
+        BaseApproachSystem(scenario.base_approach, valve),
         StancePlannerSystem(StancePlanner(scenario.stance_planner, stances)),
-        KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, robot, area)),
+        KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, robot, valve, area)),
         ImageServoSystem(ImageServo(scenario.image_servo, robot, taught)),
-        HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, marker, robot, view)),
+        HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, valve, robot, view)),
         CommandSelectorSystem(scenario.command_selector, initial_commands(scenario), robot.torso, robot.arms),
         SupervisorSystem(scenario.supervisor),
         *(

@@ -438,14 +438,14 @@ class Command(Message):
 class PlanRequest(Message):
     """What kinematic_approach asks stance_planner for; a new `number` makes it a new question.
 
-    kind: "grasps": where both hands hold the valve at X_BV from here, for a turn by `turn_angle`;
-    "path": a collision-free way of both arms from `start` to `goal`, past the valve at X_BV.
+    kind: "grasps": where both hands hold the valve at X_BA from here, for a turn by `turn_angle`;
+    "path": a collision-free way of both arms from `start` to `goal`, past the valve at X_BA.
     """
 
     number: int = -1
     kind: str = ""
-    valve: bool = False  # there is a valve, at X_BV
-    X_BV: np.ndarray = transform()
+    valve: bool = False  # there is a valve, at X_BA
+    X_BA: np.ndarray = transform()  # its axis frame (valve/valve.py)
     posture: np.ndarray = array(-1)  # lift and waist as measured [m, rad]
     turn_angle: float = 0.0  # positive opens [rad]
     start: np.ndarray = array(-1)  # both arms, left first [rad]
@@ -465,16 +465,17 @@ class PathPlan(Message):
 class GraspPlan(Message):
     """The answer to a PlanRequest for grasps; kinematic_approach adds what it measured and passes it on.
 
-    A hand's pose in V is constant while the valve turns, since V turns with it. `swapped`: the left hand
-    takes the handle at +x of V instead of -x.
+    A hand's pose in the axis frame A (valve/valve.py) is constant while the valve turns, since A turns with it.
     """
 
     time: float = -1.0
     number: int = -1
     found: bool = False
-    X_BV: np.ndarray = transform()
-    covariance: np.ndarray = array(6, 6)  # of X_BV, as in RectangleEstimate with L replaced by B
-    swapped: bool = False
+    X_BA: np.ndarray = transform()  # the valve
+    covariance: np.ndarray = array(6, 6)  # of the marker's pose in B, as in RectangleEstimate with L replaced by B
+    handle_left: int = 0  # which of the valve's handles the hands take
+    handle_right: int = 1
+    turn: float = 0.0  # how far these grasps turn the valve, at most what was asked for, signed [rad]
     X_BG_left: np.ndarray = transform()  # grasps
     X_BG_right: np.ndarray = transform()
     q_standoff: np.ndarray = array(-1)  # both arms at the stand-offs before the grasps, left first [rad]
@@ -501,6 +502,7 @@ class TurnState(Message):
     """
 
     time: float = 0.0
+    number: int = -1  # of the GraspPlan that the hands follow
     stage: str = ""
     angle: float = 0.0  # turned since the grasp, by the line between the hands [rad]
     angle_reference: float = 0.0
@@ -513,7 +515,8 @@ class TurnState(Message):
     moment_right: np.ndarray = array(3)
     stem_force: np.ndarray = array(3)  # sum of both: the load on the stem beyond the couple [N]
     squeeze: float = 0.0  # along the bar, positive compresses it [N]
-    center: np.ndarray = array(3)  # of the hands, in B [m]
+    center: np.ndarray = array(3)  # of the turn, between the hands along the axis, in B [m]
+    axis: np.ndarray = array(3)  # u, as the turn has shown it so far, in B
 
 
 @dc.dataclass(frozen=True, eq=False)

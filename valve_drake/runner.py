@@ -145,7 +145,7 @@ def make_recorder(sink: Sink, scenario: Scenario) -> RecorderSystem:
     """The recorder with all topics of the program."""
     head = load_head(named_files.find(scenario, "head_calibration"))
     robot = robot_of(scenario)
-    frames = RobotFrames(robot, head, scenario.marker)
+    frames = RobotFrames(robot, head)
     return RecorderSystem(sink, signals(robot.groups, frames, frames.scene, pinholes(head)))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from valve_drake import config, resources, yaml_file
 from valve_drake.behaviors.base_approach import BaseApproachConfig
 from valve_drake.behaviors.grasp_geometry import StanceConfig
-from valve_drake.behaviors.hybrid_rotation import HybridRotationConfig
+from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.image_servo import ImageServoConfig
 from valve_drake.behaviors.kinematic_approach import KinematicApproachConfig
 from valve_drake.behaviors.stance_planner import StancePlannerConfig
@@ -26,7 +26,6 @@ from valve_drake.operator.operator_channel import OperatorChannelConfig
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig
 from valve_drake.perception.handle_marker import HandleMarkerConfig
 from valve_drake.perception.line_fitting import LineFittingConfig
-from valve_drake.perception.marker import Marker
 from valve_drake.perception.matching import StereoPositioningConfig
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig
 from valve_drake.stations.faults import FaultConfig
@@ -34,8 +33,8 @@ from valve_drake.stations.lcm_channels import HardwareConfig
 from valve_drake.stations.simulation_config import SimulationConfig
 from valve_drake.supervisor.command_selector import CommandSelectorConfig
 from valve_drake.supervisor.supervisor import SupervisorConfig
+from valve_drake.valve.valve import Valve
 
-PLATE = 0.15  # the valve's face that carries the marker, square [m]
 DEFAULT = "simulated.scenario.yaml"
 # Keys of older versions: a log that has them can still be replayed.
 RETIRED = (
@@ -52,6 +51,10 @@ RETIRED = (
     "handle_marker.every",
     "handle_marker.lines.single_camera",
     "hybrid_rotation.opening",
+    *(
+        f"marker.{name}"
+        for name in ("size", "handle_radius", "mark_depth", "handle_depth", "panel_depth", "handle_width")
+    ),
     "image_servo.opening",
     "kinematic_approach.home",
     "kinematic_approach.opening",
@@ -76,7 +79,7 @@ class Scenario(Config):
     robot: str = plain("robot/robot.yaml", "a path, one below models/, or a package:// URL")
     head_calibration: str = plain("", "in the place of the robot's: a path, or one below models/")
     taught: str = plain("", "in the place of the robot's: a path, or one below models/")
-    marker: Marker = dc.field(default_factory=Marker)
+    valve: Valve = dc.field(default_factory=Valve)
     color_segmentation: ColorSegmentationConfig = dc.field(default_factory=ColorSegmentationConfig)
     line_fitting: LineFittingConfig = dc.field(default_factory=LineFittingConfig)
     stereo_positioning: StereoPositioningConfig = dc.field(default_factory=StereoPositioningConfig)
@@ -97,11 +100,6 @@ class Scenario(Config):
     faults: list[FaultConfig] = dc.field(
         default_factory=list, metadata=config.about("that the twin simulates (valve_drake/stations/faults.py)")
     )
-
-    def check(self, key: str | None = None) -> None:
-        for length in self.marker.size:  # first: what else is wrong with a marker that large is no help
-            require(length <= PLATE, "marker.size", f"not larger than the panel's face of {PLATE} m", self.marker.size)
-        super().check(key)
 
     def relations(self, key: str) -> None:
         """What the blocks have to agree on."""

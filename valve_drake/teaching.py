@@ -22,7 +22,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram
 
-from valve_drake import config, named_files, outputs
+from valve_drake import named_files, outputs
 from valve_drake.behaviors.taught import MadeFor, TaughtReference, load_made_for, save_taught
 from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.diagram import initial_commands, make_station, robot_of
@@ -30,7 +30,6 @@ from valve_drake.frames import make
 from valve_drake.messages import SIDES, CameraFrame, HandleMark, Health
 from valve_drake.pace import Pacer
 from valve_drake.perception.handle_marker import HandleMarkerConfig, find_mark
-from valve_drake.perception.marker import Marker
 from valve_drake.ports import SLOT, TICK
 from valve_drake.robot.robot import Robot
 from valve_drake.scenario import Scenario, resolve
@@ -38,6 +37,8 @@ from valve_drake.stations.bus import Bus
 from valve_drake.stations.contract import vectors
 from valve_drake.stations.hardware import AHEAD, RobotLink
 from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig
+from valve_drake.valve.model import MARK
+from valve_drake.valve.valve import Valve
 
 PROBE = 0.015  # of the hand to both sides along each of its axes, at most [m]
 ROOM = 0.6  # share of the room between handle and pads that it takes; raise it for hands that hardly open
@@ -62,10 +63,12 @@ Pictures = dict[str, np.ndarray]  # of each hand at its handle (H, W, 3)
 # ---------------------------------------------------------------- what references are good for
 
 
-def made_for(robot: Robot, marker: Marker) -> MadeFor:
-    """What the images at the handles depend on: the wrist cameras in their hands, the marker, the opening."""
+def made_for(robot: Robot, valve: Valve) -> MadeFor:
+    """What the images at the handles depend on: the wrist cameras in their hands, the green marks, the opening."""
     cameras = [np.round(robot.X_GC(side), 6) + 0.0 for side in SIDES]
-    return MadeFor(_hash(repr([X.tolist() for X in cameras])), _hash(repr(config.tree(marker))), robot.opening)
+    return MadeFor(
+        _hash(repr([X.tolist() for X in cameras])), _hash(repr((valve.marker.mark_height, MARK))), robot.opening
+    )
 
 
 def _hash(text: str) -> str:
@@ -82,7 +85,7 @@ def prepared(scenario: Scenario, say: Callable[[str], None] = lambda line: None)
     robot = robot_of(scenario)
     if robot.description.servo != "camera":
         return scenario
-    wanted, why = made_for(robot, scenario.marker), ""
+    wanted, why = made_for(robot, scenario.valve), ""
     if scenario.taught or robot.description.taught:
         path = named_files.find(scenario, "taught")
         why = wanted.unlike(load_made_for(path))
@@ -212,7 +215,7 @@ def _lesson(ports: _Ports, robot: Robot, scenario: Scenario) -> tuple[Taught, Pi
     pictures: Pictures = {}
     _wait(ports, {})
     load = {side: ports.read(f"{side}_wrist.wrench")[3:] for side in SIDES}
-    probe = min(PROBE, ROOM * (robot.opening - scenario.marker.handle_width) / 2)
+    probe = min(PROBE, ROOM * (robot.opening - max(handle.width for handle in scenario.valve.handles)) / 2)
     last = np.zeros(3)
     for k, place in enumerate(probe * PLACES):
         before = dict(commands)
@@ -344,7 +347,7 @@ def write(scenario: Scenario, folder: Path, stop: Stop = lambda: False) -> None:
         f"{HEADING} For each hand at its handle, gripper open: feature (u, v, 1)/sqrt(area),\n"
         "image Jacobian d feature / d hand translation [1/m] in its frame, the mark's area [px^2] and corners [px].\n"
         "made_for: what of the robot, marker and opening [m] they are good for.",
-        made_for(robot_of(scenario), scenario.marker),
+        made_for(robot_of(scenario), scenario.valve),
     )
     for side, picture in pictures.items():
         _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

@@ -179,10 +179,10 @@ def draw_bar(canvas: Canvas, X_CV: np.ndarray, marker: Marker) -> None:
     def at(x: float, z: float) -> np.ndarray:
         return frames.compose(X_CV, frames.make(np.eye(3), np.array([x, 0, z])))
 
-    r = marker.handle_radius
-    canvas.rectangle(at(0, marker.mark_depth + 0.001), METAL, (r + 0.03, 0.0125))
+    r, _, depth = (float(n) for n in marker.marks[0])  # a bar along x
+    canvas.rectangle(at(0, depth + 0.001), METAL, (r + 0.03, 0.0125))
     for x in (-r, r):
-        canvas.rectangle(at(x, marker.mark_depth), GREEN, (0.020, 0.011))
+        canvas.rectangle(at(x, depth), GREEN, (0.020, 0.011))
     plate = 0.75 * max(marker.size)
     canvas.disc(at(0, 0.001), PLATE, (plate, plate))
     canvas.rectangle(X_CV, RED, (marker.size[0] / 2, marker.size[1] / 2))

@@ -27,6 +27,7 @@ from valve_drake.stations.contract import HEAD
 from valve_drake.stations.scene import start_pose
 from valve_drake.stations.simulated import true_head
 from valve_drake.stations.simulation_config import CameraConfig, ErrorConfig, LightConfig, StartConfig, ValveConfig
+from valve_drake.valve.valve import Valve
 
 BANDS = ((0.6, 0.9), (0.9, 1.4), (1.4, 2.2), (2.2, 3.2))  # of the marker's distance from the left eye [m]
 BEARING, HEADING, PITCH = 0.5, 0.12, (-0.1, 0.6)  # of the drawn places: +-, +-, lowest and highest [rad]
@@ -51,8 +52,7 @@ class _Studio:
         self._robot = robot_of(Scenario())
         none = ErrorConfig(head_yaw=0.0, head_rotation=0.0, head_mount=0.0)
         mounts = true_head(self.eyes, none, seed, self._robot.description.cameras["head_left"])
-        size = (self.marker.size[0], self.marker.size[1])
-        self.rig = CameraRig(mounts, self.valve, size, LightConfig(), camera, seed)
+        self.rig = CameraRig(mounts, self.valve, Valve(), LightConfig(), camera, seed)
         self.noise = float(self.camera.noise)  # type: ignore[arg-type]  # resolved: no distribution
 
     def place(self, rng: np.random.Generator, band: tuple[float, float]) -> _Place:

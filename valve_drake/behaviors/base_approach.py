@@ -40,8 +40,8 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.motion import slew, towards
-from valve_drake.perception.marker import Marker
 from valve_drake.task.modes import owned
+from valve_drake.valve.valve import Valve, heading
 
 MODES = owned("base_approach")
 RAISED = 0.01  # lift and waist are at the stance's when they are off by less [m, rad]
@@ -134,7 +134,7 @@ class Memory:
 
 def step(
     config: BaseApproachConfig,
-    marker: Marker,
+    valve: Valve,
     memory: Memory,
     time: float,
     dt: float,
@@ -159,7 +159,7 @@ def step(
         if mode.mode == Mode.ROUGH_APPROACH:
             m, goal = _rough(config, m, dt, robot_state, position)
         elif mode.mode == Mode.FINE_APPROACH:
-            m, goal = _fine(config, marker, m, time, dt, robot_state, estimate, stance)
+            m, goal = _fine(config, valve, m, time, dt, robot_state, estimate, stance)
         else:
             m, goal = _retreat(config, m, time, dt, robot_state)
     m = changed(m, twist=slew(m.twist, goal, np.array([config.acceleration, config.yaw_acceleration]) * dt))
@@ -263,7 +263,7 @@ def _offset(base: np.ndarray, goal: np.ndarray) -> _Offset:
 
 def _fine(
     config: BaseApproachConfig,
-    marker: Marker,
+    valve: Valve,
     m: Memory,
     time: float,
     dt: float,
@@ -272,7 +272,7 @@ def _fine(
     stance: Stance,
 ) -> tuple[Memory, np.ndarray]:
     if estimate.found and estimate.time > m.panel.seen:
-        m = changed(m, panel=m.panel.add(estimate.time, _panel(marker, estimate), config.sightings))
+        m = changed(m, panel=m.panel.add(estimate.time, _panel(valve, estimate), config.sightings))
     if stance.found and stance.time > m.stance.seen:
         m = changed(m, stance=m.stance.add(stance.time, stance.base, config.sightings), posture=stance.posture)
     if not (_sure(config, m.panel) and _sure(config, m.stance)):
@@ -288,7 +288,7 @@ def _fine(
     if m.phase != "settle":
         m = changed(m, quiet_since=time)  # stillness counts from there on
     if m.phase == "plan":
-        m = _plan(config, m, base, goal, at, _ahead(panel, -marker.panel_depth))
+        m = _plan(config, m, base, goal, at, _ahead(panel, valve.marker.xyz[2] - valve.panel.depth))
         if m.result == "failed":
             return m, np.zeros(2)
     if m.phase == "settle":
@@ -305,11 +305,13 @@ def _ahead(pose: np.ndarray, distance: float) -> np.ndarray:
     return pose[:2] + distance * np.array([np.cos(pose[2]), np.sin(pose[2])])
 
 
-def _panel(marker: Marker, estimate: RectangleEstimate) -> np.ndarray:
-    """A point of the panel's plane and the heading of its normal into it, on the floor -> (3,)."""
-    X_OV = compose(estimate.X_OL, estimate.X_LV)
-    pose = np.array([*X_OV[:2, 3], np.arctan2(X_OV[1, 2], X_OV[0, 2])])
-    return np.array([*_ahead(pose, marker.panel_depth), pose[2]])
+def _panel(valve: Valve, estimate: RectangleEstimate) -> np.ndarray:
+    """The stem at the panel and the heading of the panel's normal into it, on the floor -> (3,).
+
+    Before a valve whose axis is upright it is an upright plane through the axis, facing the robot.
+    """
+    X_OA = compose(estimate.X_OL, estimate.X_LV, valve.X_VA())
+    return np.array([*compose(X_OA, valve.X_AP())[:2, 3], heading(X_OA, estimate.X_OL[:2, 3])])
 
 
 def _pre_stance(config: BaseApproachConfig, goal: np.ndarray) -> np.ndarray:

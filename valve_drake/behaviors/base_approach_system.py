@@ -2,8 +2,8 @@
 
 from valve_drake.behaviors.base_approach import MODES, BaseApproachConfig, Memory, step
 from valve_drake.messages import Command, ModeState, RectangleEstimate, RobotState, Stance, Status, StereoPosition
-from valve_drake.perception.marker import Marker
 from valve_drake.ports import TICK, Block, Inputs, Outputs
+from valve_drake.valve.valve import Valve
 
 
 class BaseApproachInputs(Inputs):
@@ -31,11 +31,10 @@ class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
     AWAKE = frozenset(MODES)
     OUTPUTS = {"command": Command, "status": Status}
 
-    def __init__(self, config: BaseApproachConfig, marker: Marker, name: str = "base_approach"):
+    def __init__(self, config: BaseApproachConfig, valve: Valve, name: str = "base_approach"):
         config.check()
-        marker.check()
         self.config = config
-        self.marker = marker
+        self.valve = valve
         super().__init__(name, period=2 * TICK)
 
     def initial(self) -> Memory:
@@ -44,7 +43,7 @@ class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
     def step(self, time: float, inputs: BaseApproachInputs, memory: Memory) -> tuple[Memory, Outputs]:
         memory, command, status = step(
             self.config,
-            self.marker,
+            self.valve,
             memory,
             time,
             self.period,

@@ -1,21 +1,22 @@
-"""Where the hands hold the valve, at any angle of it; and the stance: where the base stands so that they can.
+"""Which turns both hands can follow, holding the valve; and the stance: where the robot stands so that they can.
 
-With both hands on the handles, a hand's pose X_VG in the marker's frame does not change while the valve
-turns, since V turns with it. Turning by theta (positive opens, about -z of V): X_OV(theta) = X_OV R_z(-theta).
+With both hands on handles, a hand's pose X_AG in the valve's axis frame does not change while the valve turns, since A
+turns with it. A turn that is longer than one grasp reaches is made of several: turn, let go, take other handles.
 """
 
 import dataclasses as dc
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 import numpy as np
 
 from valve_drake.checks import require
 from valve_drake.config import Config, number
-from valve_drake.frames import compose, inverse, make, planar, rot_z
+from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import LEFT, RIGHT, SIDES
-from valve_drake.perception.marker import Marker
-from valve_drake.robot.kinematics import OUTWARD, RobotKinematics
+from valve_drake.robot.kinematics import RobotKinematics
+from valve_drake.valve.valve import Valve, heading, turned
 
 MAX_PLACES = 40  # distances of one search for a stance: it must end while the robot waits
 
@@ -30,15 +31,17 @@ class StanceConfig(Config):
     )
     distance_max: float = number(0.84, 0.5, 1.2, "largest distance that is tried [m]")
     distance_step: float = number(0.02, 0.005, 0.2, "between two distances; halving it doubles the search [m]")
+    aside: float = number(0.12, 0.0, 0.5, "to either side that is tried where straight before the valve fails [m]")
+    lift_step: float = number(0.08, 0.01, 1.0, "between two heights of a lift that are tried [m]")
     standoff: float = number(
         0.12, 0.02, 0.3, "hands start and end this far from the grasp, along the wrist camera's view [m]"
     )
     arc_step: float = number(
         0.27, 0.1, 1.0, "between two angles of the turn that are checked; halving it doubles the search [rad]"
     )
-    lift_step: float = number(0.08, 0.01, 1.0, "between two heights of a lift that are tried [m]")
+    arc_least: float = number(0.4, 0.1, 3.0, "a grasp that turns less is no use, unless that is all that is left [rad]")
     margin_enough: float = number(0.9, 0.01, 1.0, "the search ends at the first stance with this arm margin")
-    margin_good: float = number(0.5, 0.01, 1.0, "with a stance of this arm margin no other height is tried")
+    margin_good: float = number(0.5, 0.01, 1.0, "with a stance of this arm margin nothing less simple is tried")
     margin_min: float = number(0.15, 0.01, 1.0, "least arm margin that is accepted (1 is comfortable)")
 
     def relations(self, key: str) -> None:
@@ -49,24 +52,6 @@ class StanceConfig(Config):
         require(few, f"{key}.distance_step", f"at least {least:.3g}: {MAX_PLACES} distances", self.distance_step)
 
 
-def turned(X_AV: np.ndarray, angle: float) -> np.ndarray:
-    """The marker's pose after the valve turned by `angle` (positive opens) -> (3, 4)."""
-    return compose(X_AV, make(rot_z(-angle), np.zeros(3)))
-
-
-def angle_turned(X_AV0: np.ndarray, X_AV1: np.ndarray) -> float:
-    """The angle turned from pose 0 to pose 1 about the common axis, in (-pi, pi], positive opens."""
-    R = X_AV0[:, :3].T @ X_AV1[:, :3]
-    return float(-np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
-
-
-def hand_in_valve(side: str, swapped: bool, marker: Marker) -> np.ndarray:
-    """X_VG of a hand on its handle -> (3, 4). z_G into the panel, x_G along the bar, towards the left hand's end."""
-    s = OUTWARD[side] * (-1.0 if swapped else 1.0)
-    R = np.eye(3) if swapped else np.diag([-1.0, -1.0, 1.0])
-    return make(R, np.array([-s * marker.handle_radius, 0, marker.handle_depth]))
-
-
 def standoff(X_AG: np.ndarray, view_G: np.ndarray, distance: float) -> np.ndarray:
     """The hand drawn back from X_AG by `distance` against its camera's view direction (in G), so that the
     mark stays in the middle of the wrist image -> (3, 4)."""
@@ -74,25 +59,46 @@ def standoff(X_AG: np.ndarray, view_G: np.ndarray, distance: float) -> np.ndarra
 
 
 @dc.dataclass(frozen=True)
-class ArcCheck:
-    """Both arms along a turn: the least margin over it, and each arm's joint angles at its start."""
+class Grasp:
+    """Where a hand holds the valve: which of its handles, and which way round (Valve.grasp)."""
 
-    margin: float
-    swapped: bool
-    q: Mapping[str, np.ndarray] = dc.field(default_factory=dict)  # side -> (n,); empty if the turn is out of reach
-    q_standoff: Mapping[str, np.ndarray] = dc.field(default_factory=dict)  # the same at the stand-off before it
+    handle: int
+    sign: float
+
+
+Pair = Mapping[str, Grasp]  # by side
+
+
+@dc.dataclass(frozen=True)
+class Arc:
+    """Both arms along a turn.
+
+    margin: the least of the arms over it; -1: out of reach. turn: how far it goes, at most what was asked for [rad].
+    q, q_standoff: side -> joints at the turn's start, and at the stand-off before it (n,); empty if out of reach.
+    begun: the hands reach the handles where the turn begins.
+    """
+
+    margin: float = -1.0
+    turn: float = 0.0
+    grasps: Pair = dc.field(default_factory=dict)
+    q: Mapping[str, np.ndarray] = dc.field(default_factory=dict)
+    q_standoff: Mapping[str, np.ndarray] = dc.field(default_factory=dict)
+    begun: bool = False
 
 
 JUMP = 1.0  # a joint that moves so far between two angles of the turn is on another branch [rad]
+ONE_GRASP = 2.3  # a longer turn is not tried with one grasp alone [rad]
+CROSSED = 0.02  # the left hand is to the right of the right one by more than this [m]
+PAIRS = 6  # of handles, at most, that are tried of each kind
 
 
 class Free(Protocol):
-    """No contact and enough clearance with both arms at q, the valve at X_BV (None: no valve).
+    """No contact and enough clearance with both arms at q, the valve at X_BA (None: no valve).
 
     posture: lift and waist; None: at home.
     """
 
-    def __call__(self, X_BV: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None) -> bool: ...
+    def __call__(self, X_BA: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None) -> bool: ...
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -105,17 +111,20 @@ class Place:
 
 @dc.dataclass(frozen=True, eq=False)
 class StanceSearch:
-    """A search for a stance, cut into portions of one place each: `Stances.advance` makes the next one.
+    """A search for a stance, cut into portions of one grasp's arc each: `Stances.advance` makes the next one.
 
     places: by group; the search ends with a place of `margin_enough`, or after a group that has one of `margin_good`.
     """
 
-    X_OV: np.ndarray
+    X_OA: np.ndarray
     turn_angle: float
     places: tuple[tuple[Place, ...], ...]
     group: int = 0
     index: int = 0  # of the next place in its group
-    arc: ArcCheck | None = None  # of the place before, to start from
+    arc: Arc | None = None  # of the place before, to start from
+    turned: float = 0.0  # of the turn, by the grasps at this place that are found [rad]
+    grasps: int = 0  # how many these are
+    least: float = 1.0  # their margin
     best: Place | None = None
     margin: float = -1.0  # of `best`
     done: bool = False
@@ -129,113 +138,203 @@ class Stances:
     """
 
     robot: RobotKinematics
-    marker: Marker
+    valve: Valve
     config: StanceConfig
     view: Mapping[str, np.ndarray]
     is_free: Free
 
+    # ------------------------------------------------------------ one grasp
     def check_arc(
         self,
-        X_BV: np.ndarray,
+        X_BA: np.ndarray,
         turn_angle: float,
-        swapped: bool,
+        grasps: Pair,
         near: Mapping[str, np.ndarray] | None = None,
         least: float = 0.0,
         posture: np.ndarray | None = None,
-    ) -> ArcCheck:
-        """Whether both hands can hold their handles all along the turn, and draw back from them at both ends.
+        *,
+        whole: bool = True,
+    ) -> Arc:
+        """How far both hands can hold their handles along a turn, and draw back from them at both ends.
 
-        X_BV: marker in the base. near: joints of a like arc's start, by side. posture: lift and waist; None: at home.
+        X_BA: the valve in the base. near: joints of a like arc's start, by side.
+        posture: lift and waist; None: at home.
         least: the check ends where the margin falls to it: whoever asks knows a better arc.
-        Unless the arms are free of all at the turn's start, middle and end, and drawn back, the margin is -1.
+        whole: a turn that is not followed to its end is out of reach; else as far as the margin is `margin_good`, or,
+        if that is not `arc_least`, as far as it is accepted.
+        Unless the arms are free of all at the turn's start, middle and end, and drawn back, it is out of reach.
         """
-        robot, out = self.robot, ArcCheck(-1.0, swapped)
-        count = max(2, int(np.ceil(abs(turn_angle) / self.config.arc_step)) + 1)
+        c = self.config
+        count = max(2, int(np.ceil(abs(turn_angle) / c.arc_step)) + 1)
         angles = np.linspace(0.0, turn_angle, count)
-        margin = 1.0
-        arcs: dict[str, list[np.ndarray]] = {side: [] for side in SIDES}
+        limit = least if whole else c.margin_min
+        arms = {side: self._follow(X_BA, angles, side, grasps[side], near, limit, posture) for side in SIDES}
+        begun = all(len(q) for q, _ in arms.values())
+        reached = min(len(q) for q, _ in arms.values())
+        out = Arc(-1.0, 0.0, grasps, begun=begun)
+        if reached < 2 or (whole and reached < count):
+            lowest = min(margins[-1] if margins else -1.0 for _, margins in arms.values())
+            return dc.replace(out, margin=min(lowest, least)) if whole and begun and lowest <= least else out
+        margins = np.minimum(*(np.minimum.accumulate(arms[side][1][:reached]) for side in SIDES))
+        ends = [reached - 1]
+        if not whole:
+            ends = list(range(reached - 1, 0, -1))
+            good = [k for k in ends if margins[k] >= c.margin_good and abs(angles[k]) >= c.arc_least]
+            ends = good or [k for k in ends if abs(angles[k]) >= min(c.arc_least, abs(turn_angle))]
+        for end in ends[:4]:
+            arc = self._arc(X_BA, angles[: end + 1], grasps, {side: arms[side][0] for side in SIDES}, posture)
+            margin = min(arc.margin, float(margins[end]))
+            if arc.q and margin > limit:
+                return dc.replace(arc, margin=margin)
+            if whole:
+                return dc.replace(out, margin=margin if arc.q else -1.0)
+        return out
+
+    def _follow(
+        self,
+        X_BA: np.ndarray,
+        angles: np.ndarray,
+        side: str,
+        grasp: Grasp,
+        near: Mapping[str, np.ndarray] | None,
+        least: float,
+        posture: np.ndarray | None,
+    ) -> tuple[list[np.ndarray], list[float]]:
+        """One arm's joints and margins at the angles of a turn, up to where it can follow with a margin over `least`.
+
+        A margin that falls to `least` is the last of the second list, which is then the longer one.
+        """
+        robot, X_AG = self.robot, self.valve.grasp(grasp.handle, grasp.sign)
+        q_last = near.get(side) if near else None
+        arc: list[np.ndarray] = []
+        margins: list[float] = []
+        for k, angle in enumerate(angles):
+            X_BG = compose(turned(X_BA, angle), X_AG)
+            start = q_last if k < 2 else 2 * arc[-1] - arc[-2]  # goes on as before
+            q = robot.inverse(side, X_BG, start, posture)
+            if q is None and k == 0 and q_last is not None:
+                q = robot.inverse(side, X_BG, posture=posture)
+            if q is None or (k > 0 and q_last is not None and np.max(np.abs(q - q_last)) > JUMP):
+                break
+            margins.append(robot.margin(side, q))
+            if margins[-1] <= least:
+                break
+            arc.append(q)
+            q_last = q
+        return arc, margins
+
+    def _arc(
+        self,
+        X_BA: np.ndarray,
+        angles: np.ndarray,
+        grasps: Pair,
+        q: Mapping[str, list[np.ndarray]],
+        posture: np.ndarray | None,
+    ) -> Arc:
+        """The arc over all of these angles: the hands draw back at its ends, and the arms are free of all."""
+        robot, margin, last = self.robot, 1.0, len(angles) - 1
         backs: dict[str, list[np.ndarray]] = {side: [] for side in SIDES}
         for side in SIDES:
-            X_VG = hand_in_valve(side, swapped, self.marker)
-            q_last = near.get(side) if near else None
-            for k, angle in enumerate(angles):
-                X_BG = compose(turned(X_BV, angle), X_VG)
-                start = q_last if k < 2 else 2 * arcs[side][-1] - arcs[side][-2]  # goes on as before
-                q = robot.inverse(side, X_BG, start, posture)
-                if q is None and k == 0 and q_last is not None:
-                    q = robot.inverse(side, X_BG, posture=posture)
-                if q is None or (k > 0 and q_last is not None and np.max(np.abs(q - q_last)) > JUMP):
-                    return out
-                margin = min(margin, robot.margin(side, q))
-                if k in (0, count - 1):
-                    back = robot.inverse(side, standoff(X_BG, self.view[side], self.config.standoff), q, posture)
-                    if back is None:
-                        return out
-                    margin = min(margin, robot.margin(side, back))
-                    backs[side].append(back)
-                if margin <= least:
-                    return ArcCheck(margin, swapped)
-                arcs[side].append(q)
-                q_last = q
-        poses = [(angles[k], arcs, k) for k in (0, count // 2, count - 1)]
-        poses += [(angles[0], backs, 0), (angles[-1], backs, 1)]
-        for angle, joints, k in poses:
+            X_AG = self.valve.grasp(grasps[side].handle, grasps[side].sign)
+            for k in (0, last):
+                X_BG = compose(turned(X_BA, angles[k]), X_AG)
+                back = robot.inverse(side, standoff(X_BG, self.view[side], self.config.standoff), q[side][k], posture)
+                if back is None:
+                    return Arc(grasps=grasps, begun=True)
+                margin = min(margin, robot.margin(side, back))
+                backs[side].append(back)
+        poses = [(k, q, k) for k in (0, (last + 1) // 2, last)] + [(0, backs, 0), (last, backs, 1)]
+        for at, joints, k in poses:
             q_both = np.concatenate([joints[side][k] for side in SIDES])
-            if not self.is_free(turned(X_BV, angle), q_both, posture):
-                return out
-        return ArcCheck(
-            margin, swapped, {side: arcs[side][0] for side in SIDES}, {side: backs[side][0] for side in SIDES}
-        )
+            if not self.is_free(turned(X_BA, angles[at]), q_both, posture):
+                return Arc(grasps=grasps, begun=True)
+        first, behind = ({side: joints[side][0] for side in SIDES} for joints in (q, backs))
+        return Arc(margin, float(angles[last]), grasps, first, behind, True)
+
+    # ------------------------------------------------------------ the best of all grasps
+    def pairs(self, X_BA: np.ndarray, turn_angle: float) -> Iterator[tuple[Pair, ...]]:
+        """What both hands may hold, in groups that get worse: arms that do not cross, before those that do; fingers
+        with x_G to the robot's left, before the other way round."""
+        middle = turned(X_BA, turn_angle / 2)
+        ahead = middle[:, :3] @ np.array([0.0, 0, 1])
+        aside = np.array([-ahead[1], ahead[0]])  # to the robot's left, along the panel
+        level = np.linalg.norm(aside)
+        aside = aside / level if level > 0.3 else np.array([0.0, 1.0])
+        count = range(len(self.valve.handles))
+        places = [compose(middle, self.valve.grasp(k, 1.0)) for k in count]
+        at = [float(aside @ X[:2, 3]) for X in places]
+        sign = [1.0 if aside @ X[:2, 0] >= 0 else -1.0 for X in places]
+        both = sorted(itertools.permutations(count, 2), key=lambda pair: at[pair[1]] - at[pair[0]])
+        plain = [pair for pair in both if at[pair[0]] - at[pair[1]] > -CROSSED][:PAIRS]
+        crossed = [pair for pair in both if pair not in plain][:PAIRS]
+        for some in (plain, crossed):
+            for flips in (((1.0, 1.0),), ((-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))):
+                yield tuple(
+                    {LEFT: Grasp(i, sign[i] * flip[0]), RIGHT: Grasp(k, sign[k] * flip[1])}
+                    for i, k in some
+                    for flip in flips
+                )
 
     def best_arc(
         self,
-        X_BV: np.ndarray,
+        X_BA: np.ndarray,
         turn_angle: float,
-        near: ArcCheck | None = None,
+        near: Arc | None = None,
         least: float = 0.0,
         posture: np.ndarray | None = None,
-    ) -> ArcCheck:
-        """The assignment of the handles to the hands with which the arms do not cross; where that does not serve, the
-        better of the two by its margin. near: a like arc, to start from; the rest: as of `check_arc`."""
-        middle = turned(X_BV, turn_angle / 2)
-        left = {
-            swapped: compose(middle, hand_in_valve(LEFT, swapped, self.marker))[1, 3]
-            - compose(middle, hand_in_valve(RIGHT, swapped, self.marker))[1, 3]
-            for swapped in (False, True)
-        }
-        orders = sorted(left, key=lambda swapped: -left[swapped])  # left hand on the left first
-        best = ArcCheck(-1.0, orders[0])
-        for swapped in orders:
-            start = near.q if near is not None and near.swapped == swapped else None
-            arc = self.check_arc(X_BV, turn_angle, swapped, start, max(best.margin, least), posture)
-            if arc.margin > best.margin:
-                best = arc
-            if best.margin >= self.config.margin_min:
+    ) -> Arc:
+        """The first grasps of `pairs` that serve for the whole turn, the best of their group; for a turn that is longer
+        than one grasp reaches, those that turn the farthest. near: a like arc; the rest: as of `check_arc`."""
+        c = self.config
+        whole = abs(turn_angle) <= ONE_GRASP
+        asked = turn_angle if whole else float(np.copysign(ONE_GRASP / 2, turn_angle))
+        best, begun = Arc(), False
+        for k, group in enumerate(self.pairs(X_BA, asked)):
+            if k % 2 == 1 and not begun:
+                continue  # other fingers reach no farther
+            for pair in group:
+                start = near.q if near is not None and dict(near.grasps) == dict(pair) else None
+                bound = max(best.margin, least) if whole else 0.0
+                arc = self.check_arc(X_BA, turn_angle, pair, start, bound, posture, whole=whole)
+                begun = begun or arc.begun
+                if _better(arc, best, whole):
+                    best = arc
+                if best.margin >= c.margin_good and (whole or abs(best.turn) > 2.5):
+                    break
+            if best.margin >= c.margin_min:
                 break
         return best
 
     # ------------------------------------------------------------ where to stand
-    def begin(self, X_OV: np.ndarray, turn_angle: float, posture: np.ndarray | None = None) -> StanceSearch:
-        """A search for the stance from which the valve at X_OV can be turned.
+    def begin(
+        self, X_OA: np.ndarray, turn_angle: float, viewer: np.ndarray, posture: np.ndarray | None = None
+    ) -> StanceSearch:
+        """A search for the stance from which the valve at X_OA can be turned. viewer: the robot's place (x, y) now.
 
         posture: of a stance that was found for nearly the same valve: kept while it serves, since lifts are slow.
         """
-        return StanceSearch(X_OV, turn_angle, self._places(X_OV, posture))
+        return StanceSearch(X_OA, turn_angle, self._places(X_OA, viewer, posture))
 
-    def _places(self, X_OV: np.ndarray, posture: np.ndarray | None) -> tuple[tuple[Place, ...], ...]:
-        """Square to the panel, from near to far; first with the lift as given, then at home, then at other heights."""
-        heading = float(np.arctan2(X_OV[1, 2], X_OV[0, 2]))  # of z_V, into the panel, on the floor
-        forward = np.array([np.cos(heading), np.sin(heading)])
-        axis_point = X_OV[:, 3] + self.marker.panel_depth * X_OV[:, 2]  # the stem at the panel
+    def _places(
+        self, X_OA: np.ndarray, viewer: np.ndarray, posture: np.ndarray | None
+    ) -> tuple[tuple[Place, ...], ...]:
+        """Square to the panel, from near to far; first with the lift as given, then at home, then at other heights,
+        then a step aside."""
         c = self.config
+        angle = heading(X_OA, viewer)
+        forward, left = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        stem = compose(X_OA, self.valve.X_AP())[:2, 3]  # at the panel
         distances = np.arange(c.distance_min, c.distance_max + 1e-9, c.distance_step)
-        bases = [np.array([*(axis_point[:2] - distance * forward), heading]) for distance in distances]
+        bases = [np.array([*(stem - distance * forward), angle]) for distance in distances]
         home = self.robot.posture.home
         groups = [tuple(Place(base) for base in bases)]
         if posture is not None and np.max(np.abs(posture - home), initial=0.0) > 1e-3:
             groups.insert(0, tuple(Place(base, posture) for base in bases))
         if raised := self._postures():
             groups.append(tuple(Place(base, posture) for posture in raised for base in bases))
+        if c.aside > 0:
+            steps = [np.array([*(side * c.aside * left), 0.0]) for side in (1.0, -1.0)]
+            groups.append(tuple(Place(base + step) for step in steps for base in bases[::2]))
         return tuple(groups)
 
     def _postures(self) -> list[np.ndarray]:
@@ -249,25 +348,39 @@ class Stances:
         return [np.concatenate([q, joints.home[count:]]) for q in raised if np.max(np.abs(q - home)) > 1e-3]
 
     def advance(self, search: StanceSearch) -> StanceSearch:
-        """The search after its next place."""
+        """The search after one more grasp: at a place, grasps follow each other until the turn is made."""
         c, s = self.config, search
         place = s.places[s.group][s.index]
-        X_BV = compose(inverse(planar(*place.base)), s.X_OV)
-        arc = self.best_arc(X_BV, s.turn_angle, s.arc, max(s.margin, 0.0), place.posture)
-        best, margin = (place, arc.margin) if arc.margin > s.margin else (s.best, s.margin)
+        X_BA = turned(compose(inverse(planar(*place.base)), s.X_OA), s.turned)
+        asked = s.turn_angle - s.turned
+        alone = s.grasps == 0 and abs(asked) <= ONE_GRASP
+        arc = self.best_arc(X_BA, asked, s.arc, max(s.margin, 0.0) if alone else 0.0, place.posture)
+        least, left = min(s.least, arc.margin), asked - arc.turn
+        if arc.margin >= c.margin_min and abs(left) > 1e-9 and least > s.margin and s.grasps < 3:
+            # Four grasps turn a valve round, mostly; then they repeat themselves.
+            return dc.replace(s, arc=arc, turned=s.turned + arc.turn, grasps=s.grasps + 1, least=least)
+        best, margin = (place, least) if least > s.margin else (s.best, s.margin)
         group, index = s.group, s.index + 1
         if index == len(s.places[group]):
             group, index = group + 1, 0
-        left = group < len(s.places) and (index > 0 or margin < c.margin_good)
-        done = margin >= c.margin_enough or not left
-        return dc.replace(s, group=group, index=index, arc=arc, best=best, margin=margin, done=done)
+        more = group < len(s.places) and (index > 0 or margin < c.margin_good)
+        done = margin >= c.margin_enough or not more
+        fresh = dc.replace(s, group=group, index=index, arc=arc, turned=0.0, grasps=0, least=1.0)
+        return dc.replace(fresh, best=best, margin=margin, done=done)
 
-    def find(self, X_OV: np.ndarray, turn_angle: float) -> tuple[Place, float]:
+    def find(self, X_OA: np.ndarray, turn_angle: float, viewer: np.ndarray | None = None) -> tuple[Place, float]:
         """The first place with a comfortable arm margin over the whole turn; if there is none, that with the largest.
 
         Returns (place, margin); margin < 0 if there is no place from which the hands reach.
+        viewer: where the robot is now (x, y); None: the origin.
         """
-        search = self.begin(X_OV, turn_angle)
+        search = self.begin(X_OA, turn_angle, np.zeros(2) if viewer is None else viewer)
         while not search.done:
             search = self.advance(search)
         return search.best or Place(np.zeros(3)), search.margin
+
+
+def _better(arc: Arc, best: Arc, whole: bool) -> bool:
+    if whole or abs(abs(arc.turn) - abs(best.turn)) < 0.3:
+        return arc.margin > best.margin
+    return abs(arc.turn) > abs(best.turn)

@@ -1,18 +1,7 @@
 """Stage 5: both hands grasp the valve and turn it under hybrid force and position control; then let go.
 
-The two arms and the valve form one closed chain with a single free motion, the turn. With everything at the valve's
-centre c (mid-point of the hands) and u the valve's axis towards the robot, the wrenches felt by the hands and the
-hands' twists are split into common and relative parts [Uchiyama, Dauchez 1988]:
-
-    h_i = [m_i + (p_i - c) x f_i ; f_i]       h_a = h_1 + h_2       h_r = (h_2 - h_1) / 2              (1)
-    V_1 = V_a - V_r / 2,  V_2 = V_a + V_r / 2                                                          (2)
-    u . w_a = turn rate;   the other five of V_a = D_a^-1 h_a                                          (3)
-    V_r = D_r^-1 (h_r - h_r*)                                                                          (4)
-    h_r* = squeeze b - (tau / L) t                                                                     (5)
-
-hand 1 left, 2 right; b from hand 1 to 2, t = u x b, L their distance, tau the couple on the valve. D_a = 2 D and
-D_r = D / 2 give each hand the same damping D. The term of (5) in tau is necessary: the two driving forces are
-themselves a relative wrench, and with a constant h_r* the hands yield to the couple that they should apply.
+The law of the two arms and the valve is in closed_chain.py. The valve's axis is that of the plan, and is estimated as
+the turn goes on (axis_estimate.py).
 
 There is no integrator on the turn: the rate is scaled down as the torque nears its limit, and beyond the limit the
 turn yields as all other directions do, so a stuck valve stores no energy. The joints get positions only: feeding the
@@ -28,9 +17,17 @@ import math
 
 import numpy as np
 
+from valve_drake.behaviors.axis_estimate import AxisEstimate
+from valve_drake.behaviors.closed_chain import (
+    Chain,
+    contact_wrench,
+    gravity_wrench,
+    make_chain,
+    turn_rate,
+    twists,
+)
 from valve_drake.behaviors.grasp_geometry import standoff
-from valve_drake.checks import require
-from valve_drake.config import Config, number
+from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.frames import cross, make, rotation, wrap
 from valve_drake.memory import changed
 from valve_drake.messages import (
@@ -46,152 +43,11 @@ from valve_drake.messages import (
     TurnState,
     Verdict,
 )
-from valve_drake.perception.marker import Marker
-from valve_drake.robot.kinematics import HandLoad, RobotKinematics
+from valve_drake.robot.kinematics import RobotKinematics
 from valve_drake.task.modes import owned
+from valve_drake.valve.valve import Valve
 
-GRAVITY = 9.81
 AT_VALVE = (Mode.REACH, Mode.SERVO, *owned("hybrid_rotation"))  # the wrist sensors are tared or filtered
-
-
-@dc.dataclass
-class HybridRotationConfig(Config):
-    """Scenario key `hybrid_rotation`."""
-
-    KEY = "hybrid_rotation"
-    damping: float = number(
-        4000.0,
-        500.0,
-        20000.0,
-        "D of each hand, stable with 20 ms of delay each way; higher: larger forces, lower: it oscillates [N s/m]",
-    )
-    angular_damping: float = number(256.0, 16.0, 2000.0, "the same for rotations [N m s/rad]")
-    filter: float = number(
-        10.0, 1.0, 60.0, "low-pass of the wrenches; lower it for a noisy sensor, which also slows the reaction [Hz]"
-    )
-    rate: float = number(0.105, 0.005, 0.5, "of the turn, at most [rad/s]")
-    ramp: float = number(0.5, 0.05, 5.0, "time from rest to full rate, and back [s]")
-    slow: float = number(0.006, 5e-4, 0.1, "least rate near the goal [rad/s]")
-    torque_limit: float = number(
-        12.0, 1.0, 16.0, "on the valve; the rate falls to zero over its last 30 %; raise it for a stiff valve [N m]"
-    )
-    lead_limit: float = number(0.05, 0.005, 0.2, "commanded minus measured angle, at most [rad]")
-    force_trip: float = number(55.0, 10.0, 55.0, "force on one hand that ends the turn [N]")
-    squeeze: float = number(0.0, 0.0, 30.0, "internal force along the bar, positive compresses it [N]")
-    tolerance: float = number(0.001, 1e-4, 0.05, "of the turned angle as the hands measure it [rad]")
-    stall_time: float = number(2.0, 0.2, 30.0, "without progress, then it is a stall [s]")
-    stall_angle: float = number(0.01, 0.001, 0.2, "that counts as progress [rad]")
-    back_off: float = number(
-        0.07, 0.005, 0.5, "turned the other way after a stall, to tell a stop from a stuck valve [rad]"
-    )
-    grip_force: float = number(70.0, 5.0, 100.0, "of the finger actuator [N]")
-    grip_margin: float = number(0.005, 5e-4, 0.02, "a grasp is an opening within this of the handle's width [m]")
-    tug_force: float = number(8.0, 1.0, 30.0, "pull on each hand that proves the grasp [N]")
-    tug_speed: float = number(0.006, 0.001, 0.02, "pulls a hand with at most this times `damping` [m/s]")
-    tug_reach: float = number(0.012, 0.002, 0.05, "a hand that moves farther without force has missed the handle [m]")
-    close_time: float = number(4.0, 0.5, 30.0, "deadline for closing [s]")
-    relax: float = number(
-        0.6, 0.05, 10.0, "the hands yield for this long before they open, until the forces have decayed [s]"
-    )
-    open_force: float = number(40.0, 5.0, 100.0, "of the finger actuator while opening [N]")
-    retreat: float = number(0.12, 0.02, 0.3, "hands drawn back after opening [m]")
-    retreat_speed: float = number(0.10, 0.01, 0.3, "[m/s]")
-    tare_time: float = number(0.2, 0.02, 2.0, "time constant of zeroing the wrist sensors at the stand-off [s]")
-
-    def relations(self, key: str) -> None:
-        require(self.slow <= self.rate, f"{key}.slow", f"at most rate, {self.rate:g}", self.slow)
-        highest = self.force_trip / self.damping
-        gentle = self.tug_speed <= highest
-        require(gentle, f"{key}.tug_speed", f"at most force_trip / damping, {highest:.3g}", self.tug_speed)
-
-
-def gravity_wrench(R_BG: np.ndarray, hand: HandLoad) -> np.ndarray:
-    """The load of the hand's own weight on the wrist sensor, in its frame -> [torque; force] (6,)."""
-    R_SB = hand.X_SG[:, :3] @ R_BG.T
-    force = R_SB @ np.array([0.0, 0.0, -GRAVITY * hand.mass])
-    return np.concatenate([cross(hand.p_SCom, force), force])
-
-
-def contact_wrench(raw: np.ndarray, bias: np.ndarray, R_BG: np.ndarray, hand: HandLoad) -> np.ndarray:
-    """The external load on the hand at its grip point, in B: the reading `raw` without bias and weight.
-
-    raw, bias: in the sensor's frame (6,). -> [torque; force] (6,).
-    """
-    load = raw - bias - gravity_wrench(R_BG, hand)
-    torque = load[:3] - cross(hand.X_SG[:, 3], load[3:])
-    R_BS = R_BG @ hand.X_SG[:, :3].T
-    return np.concatenate([R_BS @ torque, R_BS @ load[3:]])
-
-
-@dc.dataclass(frozen=True)
-class Chain:
-    """The closed chain at one instant, measured (all in B)."""
-
-    p: np.ndarray  # grip points (2, 3), left first
-    f: np.ndarray  # forces felt (2, 3) [N]
-    m: np.ndarray  # moments felt at the grip points (2, 3) [N m]
-    c: np.ndarray  # centre (3,)
-    u: np.ndarray  # axis towards the robot
-    b: np.ndarray  # along the bar, left to right hand
-    t: np.ndarray  # u x b
-    L: float  # distance of the hands
-
-    h: np.ndarray  # h_1, h_2 of (1) (2, 6)
-    couples: np.ndarray  # that each hand exerts on the valve about u (2,) [N m]
-    torque: float  # their sum
-
-
-def make_chain(p: np.ndarray, wrenches: np.ndarray, u: np.ndarray) -> Chain:
-    """p (2, 3), wrenches at the grip points (2, 6), axis u -> Chain."""
-    c = (p[0] + p[1]) / 2
-    line = p[1] - p[0]
-    line = line - u * (u @ line)
-    L = math.sqrt(line @ line)
-    b = line / L
-    m, f = wrenches[:, :3], wrenches[:, 3:]
-    h = wrenches.copy()
-    for k in range(2):
-        h[k, :3] += cross(p[k] - c, f[k])
-    couples = -(h[:, :3] @ u)
-    return Chain(p, f, m, c, u, b, cross(u, b), L, h, couples, float(couples[0] + couples[1]))
-
-
-def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, extra: np.ndarray) -> np.ndarray:
-    """Eq. (2)-(5): the twists [w; v at c] of both hands -> (2, 6).
-
-    turn_rate: about u [rad/s]; None lets the hands yield in that direction too.
-    extra: added to the common twist (6,), e.g. a tug.
-    """
-    h1, h2 = chain.h
-    D = np.array([config.angular_damping] * 3 + [config.damping] * 3)
-    h_a, h_r = h1 + h2, (h2 - h1) / 2
-    V_a = h_a / (2 * D)
-    target = np.zeros(6)
-    if turn_rate is not None:
-        V_a[:3] += chain.u * (turn_rate - chain.u @ V_a[:3])
-        # Beyond the limit the target is constant, or the relative loop would build up force on a stuck valve.
-        couple = min(max(chain.torque, -config.torque_limit), config.torque_limit)
-        target[3:] = config.squeeze * chain.b - (couple / chain.L) * chain.t
-    V_a = V_a + extra
-    V_r = (h_r - target) / (D / 2)
-    return np.array([V_a - V_r / 2, V_a + V_r / 2])
-
-
-def turn_rate(left: float, rate: float, torque: float, lead: float, config: HybridRotationConfig, dt: float) -> float:
-    """The rate for the next tick [rad/s]. All numbers count along the sense of the turn: positive = towards the goal.
-
-    left: still to turn [rad]; rate: now; torque, lead: see the config's limits. A negative result yields to a torque
-    above its limit.
-    """
-    if torque > config.torque_limit:
-        return (config.torque_limit - torque) / (2 * config.angular_damping)
-    acceleration = config.rate / config.ramp
-    brake = math.sqrt(2 * acceleration * max(left, 0.0))
-    wanted = max(config.slow, min(config.rate, brake)) if left > 0 else 0.0
-    by_torque = (config.torque_limit - torque) / (0.3 * config.torque_limit)
-    by_lead = (config.lead_limit - lead) / (0.25 * config.lead_limit)
-    scaled = wanted * min(max(min(by_torque, by_lead), 0.0), 1.0)
-    return min(scaled, max(rate, 0.0) + acceleration * dt)
 
 
 Pair = tuple[np.ndarray, np.ndarray]  # of both hands, left first
@@ -215,7 +71,11 @@ class Memory:
     X: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # commanded X_BG
     q: Pair = dc.field(default_factory=lambda: _pair(6))  # commanded joints
     start: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # X_BG at the stage's beginning
-    b0: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # direction of the bar at the grasp
+    plan: GraspPlan = GraspPlan()  # of this grasp
+    axis: AxisEstimate | None = None  # none before the first grasp
+    u: np.ndarray = dc.field(default_factory=lambda: np.array([-1.0, 0.0, 0.0]))  # the valve's axis, towards the robot
+    middle: np.ndarray = dc.field(default_factory=lambda: np.zeros(2))  # of the hands, from the axis; see make_chain
+    b0: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # from the left hand to the right one at the grasp
     turned: float = 0.0  # by the hands since the grasp, unwrapped [rad]
     commanded: float = 0.0
     rate: float = 0.0  # commanded, along the turn's sense
@@ -236,13 +96,13 @@ class HybridRotation:
     def __init__(
         self,
         config: HybridRotationConfig,
-        marker: Marker,
+        valve: Valve,
         robot: RobotKinematics,
         view: dict[str, np.ndarray],
     ):
         config.check()
         self.config = copy.copy(config)
-        self.marker = copy.copy(marker)
+        self.valve = valve
         self.robot = robot
         self.view = view
 
@@ -259,10 +119,11 @@ class HybridRotation:
         if mode.mode in (Mode.REACH, Mode.SERVO):  # other blocks move the hands
             return changed(m, activation=-1, status=Status(), commanding=False), Command(time=time)
         p = np.array([X[0][:, 3], X[1][:, 3]])
-        u = -plan.X_BV[:, 2]
-        chain = make_chain(p, m.wrenches, u)
+        if m.axis is None or (mode.mode == Mode.GRASP and mode.activation != m.activation):
+            m = self._hold(m, plan)
+        chain = make_chain(p, m.wrenches, m.u, m.middle)
         if mode.activation != m.activation:
-            m = self._begin(time, m, mode, X, q, chain)
+            m = self._begin(time, changed(m, plan=plan), mode, X, q, chain)
         sound = bool(np.isfinite(chain.h).all())
         if sound:
             m = self._angle(m, chain)
@@ -275,6 +136,12 @@ class HybridRotation:
         m = changed(m, telemetry=self._telemetry(time, m, chain))
         command = Command(time=time, left_arm=m.q[0], right_arm=m.q[1], left_gripper=gripper, right_gripper=gripper)
         return m, command
+
+    def _hold(self, m: Memory, plan: GraspPlan) -> Memory:
+        """What is held, by the plan."""
+        handles = [self.valve.handles[k].xyz for k in (plan.handle_left, plan.handle_right)]
+        axis = AxisEstimate.begin(plan.X_BA, np.array(handles))
+        return changed(m, plan=plan, axis=axis, u=-plan.X_BA[:, 2], middle=axis.middle)
 
     # ------------------------------------------------------------ sensing
     def _sense(self, dt: float, m: Memory, state: RobotState, mode: ModeState, X: Pair) -> Memory:
@@ -322,10 +189,14 @@ class HybridRotation:
         )
 
     def _angle(self, m: Memory, chain: Chain) -> Memory:
-        """Angle of the line between the hands about u since b0, unwrapped."""
+        """Angle of the line between the hands about u since b0, unwrapped; what it tells of the axis."""
         b0 = m.b0 - chain.u * (chain.u @ m.b0)
         now = float(np.arctan2(chain.u @ cross(b0, chain.b), b0 @ chain.b))
-        return changed(m, turned=m.turned + wrap(now - m.turned))
+        m = changed(m, turned=m.turned + wrap(now - m.turned))
+        if m.stage != "turn" or m.axis is None:
+            return m
+        axis = m.axis.add(chain.p, m.turned)
+        return m if axis is m.axis else changed(m, axis=axis, u=axis.u, middle=axis.offset)
 
     # ------------------------------------------------------------ grasp
     def _grasp(
@@ -335,7 +206,7 @@ class HybridRotation:
         gripper = np.array([0.0, c.grip_force])
         extra = np.zeros(6)
         if m.stage == "close":
-            held = self._held(state)
+            held = self._held(m, state)
             m = changed(m, held_time=m.held_time + dt if held else 0.0)
             if m.held_time >= 0.4:
                 m = changed(m, stage="tug", since=time, start=m.X)
@@ -348,25 +219,35 @@ class HybridRotation:
             moved = max(float((m.X[k][:, 3] - m.start[k][:, 3]) @ chain.u) for k in range(2))
             if all(tugged):
                 m = changed(m, stage="settle", since=time)
-            elif moved > c.tug_reach or not self._held(state):
+            elif moved > c.tug_reach or not self._held(m, state):
                 detail = f"tug: {pull[0]:.1f} and {pull[1]:.1f} N, {self._openings(state)}"
                 m = self._fail(time, m, Verdict.GRASP_MISSED, detail)
             else:
                 extra[3:] = c.tug_speed * chain.u + chain.u * min(float(np.sum(pull)), 40.0) / (2 * c.damping)
         elif m.stage == "settle" and time - m.since > c.relax:
-            if self._held(state):
+            if self._held(m, state):
                 status = Status(time, m.activation, "succeeded", detail=self._openings(state))
                 m = changed(m, stage="held", status=status)
             else:
                 m = self._fail(time, m, Verdict.GRASP_MISSED, self._openings(state))
         return m, twists(chain, None, c, extra), gripper
 
-    def _held(self, state: RobotState) -> bool:
+    def _held(self, m: Memory, state: RobotState) -> bool:
         """Both grippers stopped at the handle's width and press."""
         c = self.config
-        off = (abs(opening - self.marker.handle_width) for opening in (state.left_gripper, state.right_gripper))
+        off = self._off(m, state)
         forces = (state.left_gripper_force, state.right_gripper_force)
         return all(o < c.grip_margin for o in off) and all(force > 0.5 * c.grip_force for force in forces)
+
+    def _widths(self, m: Memory) -> tuple[float, float]:
+        """Of what the hands hold [m]."""
+        left, right = (self.valve.handles[k].width for k in (m.plan.handle_left, m.plan.handle_right))
+        return left, right
+
+    def _off(self, m: Memory, state: RobotState) -> tuple[float, float]:
+        """How far both openings are from what is held [m]."""
+        left, right = self._widths(m)
+        return abs(state.left_gripper - left), abs(state.right_gripper - right)
 
     def _openings(self, state: RobotState) -> str:
         return (
@@ -380,14 +261,15 @@ class HybridRotation:
     ) -> tuple[Memory, np.ndarray, np.ndarray]:
         c = self.config
         gripper = np.array([0.0, c.grip_force])
-        sense = 1.0 if mode.turn_angle >= 0 else -1.0
+        asked = m.plan.turn
+        sense = 1.0 if asked >= 0 else -1.0
         if m.stage in ("turn", "back"):
             m = self._watch(time, dt, m, state, chain)
         if m.stage not in ("turn", "back"):
             return m, twists(chain, None, c, np.zeros(6)), gripper
         if m.stage == "back":
             sense = -sense
-        goal = mode.turn_angle if m.stage == "turn" else m.stalled_at + sense * c.back_off
+        goal = asked if m.stage == "turn" else m.stalled_at + sense * c.back_off
         left = sense * (goal - m.turned)
         if m.stage == "turn" and left <= c.tolerance:
             detail = f"{np.degrees(m.turned):.2f} deg by the hands"
@@ -400,7 +282,7 @@ class HybridRotation:
             rate = min(rate, max(m.rate - c.rate / c.ramp * dt, 0.0))
             m = changed(m, progress_at=(time, m.turned))
         m = changed(m, rate=rate, commanded=m.commanded + sense * rate * dt)
-        progress = min(max(m.turned / mode.turn_angle, 0.0), 1.0)
+        progress = min(max(m.turned / asked, 0.0), 1.0)
         m = changed(m, status=Status(time, m.activation, "running", progress=progress, value=m.turned))
         m = self._stall(time, m, sense, left)
         return m, twists(chain, sense * rate, c, np.zeros(6)), gripper
@@ -442,10 +324,9 @@ class HybridRotation:
         if m.tripped >= 3:
             verdict = Verdict.STUCK if abs(chain.torque) > 0.7 * c.torque_limit else Verdict.FAULT
             return self._fail(time, m, verdict, f"hand forces {force[0]:.0f} and {force[1]:.0f} N")
-        openings = (state.left_gripper, state.right_gripper)
-        off = any(abs(opening - self.marker.handle_width) > 2 * c.grip_margin for opening in openings)
-        share = chain.couples[0] / chain.torque if abs(chain.torque) > 2.0 else 0.5
-        bad = off or not 0.1 < share < 0.9
+        off = max(self._off(m, state)) > 2 * c.grip_margin
+        share = chain.couples[0] / chain.torque if abs(chain.torque) > 2.0 else chain.share
+        bad = off or not 0.2 * chain.share < share < 1 - 0.2 * (1 - chain.share)
         m = changed(m, bad_grip_time=m.bad_grip_time + dt if bad else 0.0)
         if m.bad_grip_time > 0.5:
             detail = f"{self._openings(state)}, left hand carries {100 * share:.0f} %"
@@ -463,7 +344,9 @@ class HybridRotation:
         grip = np.array([0.0, c.grip_force])
         opened = np.array([self.robot.opening, c.open_force])
         if m.stage == "relax":
-            closed = min(state.left_gripper, state.right_gripper) < self.marker.handle_width + 2 * c.grip_margin
+            widths = self._widths(m)
+            over = min(state.left_gripper - widths[0], state.right_gripper - widths[1])
+            closed = over < 2 * c.grip_margin
             if not closed or time - m.since > c.relax:
                 m = changed(m, stage="open", since=time)
             return m, V, grip if closed else opened
@@ -508,12 +391,13 @@ class HybridRotation:
         couples = chain.couples
         return TurnState(
             time=time,
+            number=m.plan.number,
             stage=m.stage,
             angle=m.turned,
             angle_reference=m.commanded,
             rate=m.rate,
             torque=chain.torque,
-            share_left=float(couples[0] / chain.torque) if abs(chain.torque) > 0.5 else 0.5,
+            share_left=float(couples[0] / chain.torque) if abs(chain.torque) > 0.5 else chain.share,
             force_left=chain.f[0],
             force_right=chain.f[1],
             moment_left=chain.m[0],
@@ -521,4 +405,5 @@ class HybridRotation:
             stem_force=chain.f[0] + chain.f[1],
             squeeze=float((chain.f[1] - chain.f[0]) @ chain.b / 2),
             center=chain.c,
+            axis=chain.u,
         )

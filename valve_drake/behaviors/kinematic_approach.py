@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from valve_drake.behaviors.grasp_geometry import angle_turned, turned
 from valve_drake.behaviors.joint_path import Path
 from valve_drake.config import Config, number
 from valve_drake.frames import compose, inverse, planar, wrap
@@ -47,6 +46,7 @@ from valve_drake.messages import (
 from valve_drake.perception.fusion import fuse
 from valve_drake.robot.kinematics import RobotKinematics
 from valve_drake.task.modes import TABLE
+from valve_drake.valve.valve import Valve, angle_turned, turned
 
 
 @dc.dataclass
@@ -89,7 +89,7 @@ class Memory:
     seen: int = -1  # sequence of the newest estimate used
     covariance: np.ndarray = dc.field(default_factory=lambda: np.zeros((6, 6)))  # of the valve that was measured
     request: PlanRequest = PlanRequest()  # the last one
-    X_OV0: np.ndarray | None = None  # the valve before the turn
+    X_OA0: np.ndarray | None = None  # the valve before the turn
     plan: GraspPlan = GraspPlan()
     status: Status = Status()
 
@@ -115,9 +115,16 @@ NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms
 class KinematicApproach:
     """The mathematics of the stage. reference_area: of each green mark in the taught image [px^2]."""
 
-    def __init__(self, config: KinematicApproachConfig, robot: RobotKinematics, reference_area: dict[str, float]):
+    def __init__(
+        self,
+        config: KinematicApproachConfig,
+        robot: RobotKinematics,
+        valve: Valve,
+        reference_area: dict[str, float],
+    ):
         config.check()
         self.config = copy.copy(config)
+        self._X_VA = valve.X_VA()
         self.robot = robot
         self.reference_area = reference_area
         self.home = self.robot.home
@@ -161,34 +168,34 @@ class KinematicApproach:
         return changed(m, status=Status(time, m.activation, state, verdict, detail, cause=str(cause)))
 
     def _valve(self, m: Memory, state: RobotState, turn: TurnState) -> np.ndarray | None:
-        """X_BV of the valve that was measured last, turned as the hands left it; None if there is none near."""
-        if m.X_OV0 is None:
+        """X_BA of the valve that was measured last, turned as the hands left it; None if there is none near."""
+        if m.X_OA0 is None:
             return None
-        X_BV = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OV0, turn.angle))
-        return X_BV if np.hypot(*X_BV[:2, 3]) < NEAR else None
+        X_BA = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OA0, turn.angle))
+        return X_BA if np.hypot(*X_BA[:2, 3]) < NEAR else None
 
-    def _homing(self, time: float, m: Memory, X_BV: np.ndarray | None, inputs: Inputs) -> Memory:
+    def _homing(self, time: float, m: Memory, X_BA: np.ndarray | None, inputs: Inputs) -> Memory:
         """Brings the arms home along a free path, once per activation; m.path is the move, phase "home" on arrival.
 
-        X_BV: of a valve to keep clear of; read in phase "start" alone.
+        X_BA: of a valve to keep clear of; read in phase "start" alone.
         """
         if m.phase == "start":
-            m = self._move(time, m, self.home, X_BV, inputs.state.posture)
+            m = self._move(time, m, self.home, X_BA, inputs.state.posture)
         m = self._follow(time, m, inputs.path)
         if m.phase == "moving" and (m.path is None or time >= m.path.end()):
             m = changed(m, phase="home", since=time)
         return m
 
-    def _ask(self, m: Memory, kind: str, X_BV: np.ndarray | None, **what: Any) -> Memory:
-        request = PlanRequest(m.request.number + 1, kind, X_BV is not None, np.eye(3, 4) if X_BV is None else X_BV)
+    def _ask(self, m: Memory, kind: str, X_BA: np.ndarray | None, **what: Any) -> Memory:
+        request = PlanRequest(m.request.number + 1, kind, X_BA is not None, np.eye(3, 4) if X_BA is None else X_BA)
         return changed(m, request=dc.replace(request, **what))
 
-    def _move(self, time: float, m: Memory, goal: np.ndarray, X_BV: np.ndarray | None, posture: np.ndarray) -> Memory:
+    def _move(self, time: float, m: Memory, goal: np.ndarray, X_BA: np.ndarray | None, posture: np.ndarray) -> Memory:
         """Asks for a path from the present command to `goal`: phase "planning"; "moving" if there is no way to go."""
         m = changed(m, path=None, since=time)
         if np.max(np.abs(goal - m.q)) < 1e-6:
             return changed(m, phase="moving")
-        return changed(self._ask(m, "path", X_BV, posture=posture, start=m.q, goal=goal), phase="planning")
+        return changed(self._ask(m, "path", X_BA, posture=posture, start=m.q, goal=goal), phase="planning")
 
     def _follow(self, time: float, m: Memory, answer: PathPlan) -> Memory:
         """Takes the path that was asked for: phase "moving", or "blocked" if there is none."""
@@ -223,9 +230,10 @@ class KinematicApproach:
         past = inputs.state.history[:, 4:-2]
         if past.size and not np.max(np.ptp(past, axis=0)) <= STILL:
             return m  # lift or waist is on its way
-        X_BV = compose(inverse(planar(*inputs.state.odometry[:3])), fused.X_OV)
-        m = changed(m, phase="planning", X_OV0=fused.X_OV, covariance=fused.covariance)
-        return self._ask(m, "grasps", X_BV, posture=inputs.state.posture, turn_angle=inputs.mode.turn_angle)
+        X_OA = compose(fused.X_OV, self._X_VA)
+        X_BA = compose(inverse(planar(*inputs.state.odometry[:3])), X_OA)
+        m = changed(m, phase="planning", X_OA0=X_OA, covariance=fused.covariance)
+        return self._ask(m, "grasps", X_BA, posture=inputs.state.posture, turn_angle=inputs.mode.turn_angle)
 
     def _plan(self, time: float, m: Memory, grasps: GraspPlan) -> Memory:
         """Takes the grasps that were asked for."""
@@ -235,7 +243,7 @@ class KinematicApproach:
         if not grasps.found:
             detail = f"arm margin {grasps.margin:.2f} from here"
             return self._status(m, time, "failed", Verdict.REACH_LIMIT, detail, cause=Cause.STANCE)
-        p = grasps.X_BV[:, 3]
+        p = grasps.X_BA[:, 3]
         detail = f"valve {np.hypot(p[0], p[1]):.3f} m ahead, {p[2]:.3f} m high, margin {grasps.margin:.2f}"
         m = changed(m, plan=dc.replace(grasps, time=time, covariance=m.covariance))
         return self._status(m, time, "succeeded", detail=detail)
@@ -244,7 +252,7 @@ class KinematicApproach:
     def _reach(self, time: float, m: Memory, inputs: Inputs) -> Memory:
         if m.phase == "start":
             m = self._status(m, time, "running")
-            m = self._move(time, m, m.plan.q_standoff, m.plan.X_BV, m.plan.posture)
+            m = self._move(time, m, m.plan.q_standoff, m.plan.X_BA, m.plan.posture)
         if m.phase == "planning":
             m = self._follow(time, m, inputs.path)
             if m.phase == "blocked":
@@ -269,7 +277,7 @@ class KinematicApproach:
         if m.phase == "start":
             m = self._status(m, time, "running")
         if m.phase in ("start", "planning", "moving"):
-            m = self._homing(time, m, turned(m.plan.X_BV, inputs.turn.angle), inputs)
+            m = self._homing(time, m, turned(m.plan.X_BA, inputs.turn.angle), inputs)
             if m.phase == "blocked":
                 return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path home")
         if m.phase == "home":
@@ -291,9 +299,9 @@ class KinematicApproach:
             return m if patient else self._unverified(m, time, inputs.mode, inputs.turn, drift)
         fused = fuse(m.looks)
         m = changed(m, phase="end")
-        if not fused.found or m.X_OV0 is None:
+        if not fused.found or m.X_OA0 is None:
             return self._status(m, time, "failed", Verdict.MARKER_LOST, fused.reason)
-        seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, inputs.turn.angle)
+        seen = self.seen_angle(m.X_OA0, compose(fused.X_OV, self._X_VA), fused.axis_known, inputs.turn.angle)
         missing = abs(inputs.mode.turn_angle - seen)
         detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(inputs.mode.turn_angle):.2f} deg"
         state_now = "succeeded" if missing <= self.config.angle_tolerance else "failed"
@@ -307,7 +315,7 @@ class KinematicApproach:
         """
         if len(looks) < self.config.frames or looks[-1].time - looks[0].time < 0.8 * self.config.still_time:
             return None
-        poses = [compose(look.X_OL, look.X_LV) for look in looks]
+        poses = [compose(look.X_OL, look.X_LV, self._X_VA) for look in looks]
         slopes = [  # of all pairs: their median is not moved by one wrong estimate
             # the rectangle repeats every quarter turn
             wrap(angle_turned(poses[i], poses[k]), np.pi / 2) / (looks[k].time - looks[i].time)
@@ -321,10 +329,10 @@ class KinematicApproach:
         asked, felt = np.degrees(mode.turn_angle), np.degrees(turn.angle)
         hands = f"hands turned {felt:.2f} deg of {asked:.2f} deg"
         m = changed(m, phase="end")
-        if drift is None or m.X_OV0 is None:
+        if drift is None or m.X_OA0 is None:
             return self._status(m, time, "failed", Verdict.UNVERIFIED, f"camera does not see the marker, {hands}")
         fused = fuse(m.looks[-1:])
-        seen = self.seen_angle(m.X_OV0, fused.X_OV, fused.axis_known, turn.angle)
+        seen = self.seen_angle(m.X_OA0, compose(fused.X_OV, self._X_VA), fused.axis_known, turn.angle)
         camera = f"camera sees {np.degrees(seen):.2f} deg, turning by {np.degrees(drift):+.2f} deg/s"
         status = self._seen(time, m, "failed", Verdict.UNVERIFIED, f"{camera}, {hands}", seen)
         return changed(m, status=status)
@@ -333,8 +341,8 @@ class KinematicApproach:
         """A status with the angle that the camera saw [rad]."""
         return Status(time, m.activation, state, verdict, detail, 1.0, angle, seen=True)
 
-    def seen_angle(self, X_OV0: np.ndarray, X_OV1: np.ndarray, axis_known: bool, by_hands: float) -> float:
+    def seen_angle(self, X_OA0: np.ndarray, X_OA1: np.ndarray, axis_known: bool, by_hands: float) -> float:
         """The turned angle by camera [rad]. The rectangle repeats every quarter turn, with the green marks every half:
         the branch nearest to what the hands felt is taken, the value is the camera's."""
         period = np.pi if axis_known else np.pi / 2
-        return by_hands + wrap(angle_turned(X_OV0, X_OV1) - by_hands, period)
+        return by_hands + wrap(angle_turned(X_OA0, X_OA1) - by_hands, period)

@@ -13,14 +13,12 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.behaviors.grasp_geometry import Stances, StanceSearch, hand_in_valve, standoff
+from valve_drake.behaviors.grasp_geometry import Stances, StanceSearch, standoff
 from valve_drake.behaviors.joint_path import PathSearch
 from valve_drake.config import Config, number
 from valve_drake.frames import compose
 from valve_drake.memory import changed
 from valve_drake.messages import (
-    LEFT,
-    RIGHT,
     SIDES,
     GraspPlan,
     Mode,
@@ -66,16 +64,13 @@ class Memory:
 
 
 class StancePlanner:
-    """The mathematics of the block. stances: where the hands can turn the valve from; they hold robot and marker."""
+    """The mathematics of the block. stances: where the hands can turn the valve from; they hold robot and valve."""
 
     def __init__(self, config: StancePlannerConfig, stances: Stances):
         config.check()
         stances.config.check()
-        stances.marker.check()
         self.config = copy.copy(config)
-        self.stances = dc.replace(
-            stances, config=copy.copy(stances.config), marker=copy.copy(stances.marker), view=dict(stances.view)
-        )
+        self.stances = dc.replace(stances, config=copy.copy(stances.config), view=dict(stances.view))
         self.robot = stances.robot
 
     def step(
@@ -105,7 +100,8 @@ class StancePlanner:
             if not fused.found:
                 return m
             last = m.stance.posture if m.stance.found else None
-            m = changed(m, search=self.stances.begin(fused.X_OV, mode.turn_angle, last))
+            X_OA, viewer = compose(fused.X_OV, self.stances.valve.X_VA()), m.looks[-1].X_OL[:2, 3]
+            m = changed(m, search=self.stances.begin(X_OA, mode.turn_angle, viewer, last))
         assert m.search is not None
         search = self.stances.advance(m.search)
         if not search.done:
@@ -130,25 +126,33 @@ class StancePlanner:
         return m
 
     def _grasps(self, request: PlanRequest) -> GraspPlan:
-        arc = self.stances.best_arc(request.X_BV, request.turn_angle, posture=request.posture)
+        arc = self.stances.best_arc(request.X_BA, request.turn_angle, posture=request.posture)
         found = arc.margin >= self.stances.config.margin_min
-        plan = GraspPlan(number=request.number, found=found, X_BV=request.X_BV, swapped=arc.swapped, margin=arc.margin)
+        plan = GraspPlan(number=request.number, found=found, X_BA=request.X_BA, margin=arc.margin)
         if not found:
             return plan
-        X_BG = {side: compose(request.X_BV, hand_in_valve(side, arc.swapped, self.stances.marker)) for side in SIDES}
-        q = np.concatenate([arc.q_standoff[side] for side in SIDES])
-        return dc.replace(plan, X_BG_left=X_BG[LEFT], X_BG_right=X_BG[RIGHT], q_standoff=q, posture=request.posture)
+        left, right = (arc.grasps[side] for side in SIDES)
+        X_BG = [compose(request.X_BA, self.stances.valve.grasp(hand.handle, hand.sign)) for hand in (left, right)]
+        return dc.replace(
+            plan,
+            handle_left=left.handle,
+            handle_right=right.handle,
+            turn=arc.turn,
+            X_BG_left=X_BG[0],
+            X_BG_right=X_BG[1],
+            q_standoff=np.concatenate([arc.q_standoff[side] for side in SIDES]),
+            posture=request.posture,
+        )
 
     def _path(self, m: Memory, request: PlanRequest) -> Memory:
         """One portion of the search for a path; where the straight line is blocked, the via poses are made."""
         search = m.path_search
         assert search is not None
-        X_BV = request.X_BV if request.valve else None
+        X_BA = request.X_BA if request.valve else None
         arms, split = self.robot.arms, self.robot.split
 
         def is_free(q: np.ndarray) -> bool:
-            within = all(arms[side].within(part) for side, part in split(q).items())
-            return within and self.stances.is_free(X_BV, q, request.posture)
+            return all(arms[side].within(part) for side, part in split(q).items()) and self.stances.is_free(X_BA, q)
 
         if search.portion == 1 and m.vias_left:
             vias = tuple(self.vias(request.start, request.goal, request.posture))

@@ -36,7 +36,7 @@ def estimate_rectangle(
     marker_size: 2 X_w, 2 Y_w [m]. The result's `found` is False, with a `reason`, if there is no such marker.
     Raises ConfigError for an impossible marker or configuration, ValueError for images of another size.
     """
-    marker = Marker(size=list(marker_size), handle_radius=max(0.15, max(marker_size)))
+    marker = Marker.of(marker_size, max(0.15, max(marker_size)))
     # What is not given is right; checking it would cost more than a step of the fit.
     given = [config for config in (segmentation, lines, matching) if config is not None]
     segmentation = segmentation or ColorSegmentationConfig()

@@ -147,7 +147,7 @@ def settle_axis(
     swapped, known = None, True
     model = marker.corners()[COUNTED_FROM[turn + 1]]
     votes = _mark_votes(views, fits[0].R, fits[0].p, marker)
-    if votes[0] != votes[1]:
+    if votes[0] + votes[2] != votes[1] + votes[3]:
         quarter = int(_along_y(votes))
     elif marker.aspect() > 1 + config.square_tolerance:
         swapped = _quarter_turned(moments, model, fits, config)
@@ -158,30 +158,32 @@ def settle_axis(
         known = track is not None and track.axis_known
     if quarter:
         fits = swapped or _quarter_turned(moments, model, fits, config) or fits
+    ends = votes[quarter] - votes[quarter + 2]  # the marks of most valves look the same from both ends
     n = fits[0].R[:, 0]
-    ahead = n @ track.X_LV[:, 0] if track is not None else n[0]
+    ahead = float(ends) if ends else n @ track.X_LV[:, 0] if track is not None else n[0]
     if ahead < 0:
         fits = [_half_turned(fit) for fit in fits]
     return (turn + quarter + 2 * int(ahead < 0)) % 4, known, fits
 
 
-def _along_y(votes: tuple[int, int]) -> bool:
-    return votes[1] > votes[0]
+def _along_y(votes: list[int]) -> bool:
+    return votes[1] + votes[3] > votes[0] + votes[2]
 
 
-def _mark_votes(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker) -> tuple[int, int]:
-    """Green marks found where they should be if X is this pose's x axis, or its y axis."""
-    r, depth = marker.handle_radius, marker.mark_depth
-    places = np.array([[r, 0, depth], [-r, 0, depth], [0, r, depth], [0, -r, depth], [0, 0, 0]])
+def _mark_votes(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker) -> list[int]:
+    """Green marks found where they should be if V were this pose turned back by 0, 1, 2, 3 quarters -> 4."""
+    turns = [frames.rot_z(-k * np.pi / 2) for k in range(4)]
+    places = np.vstack([*(marker.marks @ turn.T for turn in turns), np.zeros((1, 3))])
     votes = np.zeros(4, int)
     for view in views:
         P = (places @ R.T + p) @ view.X_CL[:, :3].T + view.X_CL[:, 3]
         if len(view.green) == 0 or not (P[:, 2] > 1e-3).all():
             continue
         xy = P[:, :2] / P[:, 2:]
-        off, far = view.green[None] - xy[:4, None], xy[:4] - xy[4]
-        votes += (off * off).sum(2).min(1) < 0.04 * (far * far).sum(1)
-    return int(votes[0] + votes[1]), int(votes[2] + votes[3])
+        off, far = view.green[None] - xy[:-1, None], xy[:-1] - xy[-1]
+        found = (off * off).sum(2).min(1) < 0.04 * (far * far).sum(1)
+        votes += found.reshape(4, -1).sum(1)
+    return [int(vote) for vote in votes]
 
 
 def _quarter_turned(

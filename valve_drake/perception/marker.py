@@ -1,37 +1,42 @@
-"""The target: a rectangle of known size on the valve, two green marks beside it on handles for the hands."""
+"""The target: a rectangle of known size on the valve, green marks beside it on handles for the hands."""
 
 import dataclasses as dc
+import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from valve_drake.checks import require
-from valve_drake.config import Config, number, numbers
 
 # Corners of the unit rectangle in V in their one order: clockwise as the camera sees them (V's z points into the
 # panel). Side k joins corner k and corner k + 1: side 0 is y = -Y_w, 1 is x = +X_w, 2 is y = +Y_w, 3 is x = -X_w.
 NEXT = [1, 2, 3, 0]
+MARKS = np.array([[0.15, 0.0, 0.028], [-0.15, 0.0, 0.028]])  # of our valve, in V [m]
 _UNIT_CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
 
 
-@dc.dataclass
-class Marker(Config):
-    """Scenario key `marker`: what is known of the valve beforehand, in V (x along the handles, z into the panel)."""
+@dc.dataclass(eq=False)
+class Marker:
+    """The rectangle, and green marks beside it.
 
-    KEY = "marker"
-    size: list[float] = numbers([0.098, 0.100], 0.005, 2.0, "2 X_w, 2 Y_w [m]")
-    handle_radius: float = number(0.15, 0.003, 5.0, "of the green marks from the axis, along +x and -x of V [m]")
-    mark_depth: float = number(0.028, -0.5, 0.5, "of the green marks behind the rectangle's plane, along z of V [m]")
-    handle_depth: float = number(0.041, 0.0, 1.0, "of the handles' centre line behind it [m]")
-    panel_depth: float = number(0.131, 0.0, 1.0, "of the panel's surface behind it [m]")
-    handle_width: float = number(0.025, 0.005, 0.08, "between the pads when grasped [m]")
+    size: 2 X_w, 2 Y_w [m]; marks: their places in V (K, 3) [m].
+    """
 
-    def relations(self, key: str) -> None:
-        require(max(self.size) <= 3 * min(self.size), f"{key}.size", "of an aspect up to 3:1", self.size)
-        least = 0.6 * max(self.size)
-        outside = self.handle_radius >= least
-        require(outside, f"{key}.handle_radius", f"outside the rectangle, at least {least:g}", self.handle_radius)
-        before = self.handle_depth <= self.panel_depth
-        require(before, f"{key}.handle_depth", f"at most panel_depth, {self.panel_depth:g}", self.handle_depth)
+    size: list[float] = dc.field(default_factory=lambda: [0.098, 0.100])
+    marks: np.ndarray = dc.field(default_factory=lambda: MARKS.copy())
+
+    @staticmethod
+    def of(size: Sequence[float], radius: float = 0.15) -> "Marker":
+        """With two marks along x, `radius` to both sides of it."""
+        return Marker(list(size), MARKS * [radius / MARKS[0, 0], 1.0, 1.0])
+
+    def check(self) -> None:
+        """Raises ConfigError: no size, or no places of marks."""
+        length = len(self.size) == 2 and all(math.isfinite(n) and 0.005 <= n <= 2.0 for n in self.size)
+        require(length, "marker.size", "2 values within [0.005, 2]", self.size)
+        require(max(self.size) <= 3 * min(self.size), "marker.size", "of an aspect up to 3:1", self.size)
+        places = self.marks.ndim == 2 and self.marks.shape[1] == 3 and bool(np.isfinite(self.marks).all())
+        require(places, "marker.marks", "places (K, 3)", self.marks.tolist())
 
     def corners(self) -> np.ndarray:
         """(4, 3) in V [m], clockwise as seen by the camera."""

@@ -62,7 +62,7 @@ class _Stages:
             head=head,
             images=images,
             slack=slack,
-            marker=Marker(size=list(size), handle_radius=max(0.15, max(size))),
+            marker=Marker.of(size, max(0.15, max(size))),
             coloring=ColorSegmentationConfig(min_fill=0.78),  # blurred colours round the corners off
             lines=LineFittingConfig(max_sigma=1.5, single_camera=images == 1),
             matching=StereoPositioningConfig(epipolar_gate=4.0 + slack, size_gate=0.3, side_gate=0.3),

@@ -2,13 +2,12 @@
 
 import numpy as np
 
-from valve_drake.behaviors.grasp_geometry import turned
 from valve_drake.camera.lens import StereoHead
-from valve_drake.frames import compose, make, planar
+from valve_drake.frames import compose, planar
 from valve_drake.messages import SIDES, GraspPlan, RectangleEstimate, RobotState, TurnState
-from valve_drake.perception.marker import Marker
 from valve_drake.recording.scene import parts_of, scene
 from valve_drake.robot.robot import Robot
+from valve_drake.valve.valve import turned
 
 Transforms = list[tuple[str, str, np.ndarray]]
 ODOMETRY = "odometry"
@@ -17,7 +16,7 @@ ODOMETRY = "odometry"
 class RobotFrames:
     """The controllers' model of the robot in its measured pose. Frames are named as in SceneGraph ("robot::chest")."""
 
-    def __init__(self, robot: Robot, head: StereoHead, marker: Marker):
+    def __init__(self, robot: Robot, head: StereoHead):
         self._model = shared = robot.model
         self._plant, instance = shared.plant, shared.robot
         self._context = self._plant.CreateDefaultContext()
@@ -31,7 +30,9 @@ class RobotFrames:
             (f"robot::{eye.body().name()}", "head_left", eye.GetFixedPoseInBodyFrame().GetAsMatrix34()),
             ("head_left", "head_right", head.X_LR),
         ]
-        self._X_VWheel = make(np.eye(3), np.array([0.0, 0.0, marker.panel_depth]))
+        valve = shared.shape
+        self._X_VA, self._X_AV, self._X_AP = valve.X_VA(), valve.X_AV(), valve.X_AP()
+        self._X_VWheel = compose(self._X_VA, self._X_AP)
         self.scene = scene(parts_of(shared.scene_graph.model_inspector()))
         self._slots = {
             "base": [self._slot(n) for n in robot.base.names],
@@ -58,16 +59,16 @@ class RobotFrames:
         X_WB = self._poses.Eval(self._context)  # of all bodies
         out = [(ODOMETRY, name, X_WB[i].GetAsMatrix34()) for i, name in self._bodies.items()] + self._constant
         if plan.found:
-            X_OV = compose(planar(*state.odometry[:3]), plan.X_BV)
+            X_OA = compose(planar(*state.odometry[:3]), plan.X_BA)
         elif estimate.found:
-            X_OV = compose(estimate.X_OL, estimate.X_LV)
+            X_OA = compose(estimate.X_OL, estimate.X_LV, self._X_VA)
         else:
             return out
-        X_OMarker = turned(X_OV, turn.angle) if plan.found else X_OV
+        X_now = turned(X_OA, turn.angle) if plan.found else X_OA
         return out + [
-            (ODOMETRY, "marker", X_OMarker),
+            (ODOMETRY, "marker", compose(X_now, self._X_AV)),
             ("marker", "valve::wheel", self._X_VWheel),
-            (ODOMETRY, "valve::panel", compose(X_OV, self._X_VWheel)),
+            (ODOMETRY, "valve::panel", compose(X_OA, self._X_AP)),
         ]
 
 

@@ -1,4 +1,4 @@
-"""The robot's model in Drake, made from its description: once for the controllers, and again wherever one simulates."""
+"""The robot's model in Drake, made from its description; names of joints and frames in it."""
 
 import dataclasses as dc
 import difflib
@@ -8,10 +8,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
     Frame,
@@ -23,7 +22,6 @@ from pydrake.multibody.tree import (
     SpatialInertia,
     UnitInertia,
 )
-from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from valve_drake import resources
 from valve_drake.checks import ConfigError, shown
@@ -45,18 +43,6 @@ class Mimic:
     follows: str
     multiplier: float
     offset: float
-
-
-@dc.dataclass(frozen=True)
-class Model:
-    """The controllers' model of the world, apart from the simulated plant: the robot, and a valve that is free."""
-
-    diagram: Diagram
-    plant: MultibodyPlant
-    scene_graph: SceneGraph
-    robot: ModelInstanceIndex
-    valve: ModelInstanceIndex
-    mimics: tuple[Mimic, ...]
 
 
 def parse(
@@ -318,15 +304,3 @@ def follower(
             q[joint] = multiplier * q[leader] + offset
 
     return follow
-
-
-# ---------------------------------------------------------------- the controllers' model
-
-
-def make_model(robot: RobotDescription) -> Model:
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-    model = add_robot(plant, robot)
-    valve = parse(plant, resources.models() / "valve" / "valve.sdf")
-    plant.Finalize()
-    return Model(builder.Build(), plant, scene_graph, model, valve, mimics(robot))

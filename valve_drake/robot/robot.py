@@ -27,15 +27,15 @@ from valve_drake.robot.description import TORQUE, RobotDescription
 from valve_drake.robot.groups import Groups
 from valve_drake.robot.kinematics import Arm, HandLoad, Joints
 from valve_drake.robot.model import (
-    Model,
     base_chain,
     follower,
     frame_named,
     joint_named,
-    make_model,
     named_joints,
     parent_joint,
 )
+from valve_drake.robot.world import Model, make_model
+from valve_drake.valve.valve import Valve
 
 _ORIGIN = np.zeros(3)
 _OPENINGS = 65  # positions of a gripper's joint at which its opening is read
@@ -180,23 +180,29 @@ class Robot:
         return Groups(self.torso.names, self.arms[LEFT].names, self.arms[RIGHT].names)
 
     @staticmethod
-    def load(path: str | Path) -> "Robot":
-        """The robot of a robot.yaml; made once for equal files. Raises ConfigError in one line."""
-        return Robot.of(descriptions.load(path), str(path))
+    def load(path: str | Path, valve: Valve | None = None) -> "Robot":
+        """The robot of a robot.yaml; made once for equal files. Raises ConfigError in one line.
+
+        valve: in its model of the world; None: ours.
+        """
+        return Robot.of(descriptions.load(path), str(path), valve)
 
     @staticmethod
-    def of(description: RobotDescription, source: str) -> "Robot":
+    def of(description: RobotDescription, source: str, valve: Valve | None = None) -> "Robot":
         """The robot of a loaded description; made once for equal ones. Raises ConfigError in one line.
 
-        source: named in errors.
+        source: named in errors. valve: in its model of the world; None: ours.
         """
+        shape = Valve() if valve is None else valve
         file = descriptions.model_file(description)
         state = file.stat()
-        key = (repr(description), str(file), state.st_mtime_ns, state.st_size)
+        key = (repr(description), str(file), state.st_mtime_ns, state.st_size, repr(shape))
         if key not in _loaded:
             try:
-                _loaded[key] = Robot(description, make_model(description))
+                _loaded[key] = Robot(description, make_model(description, shape))
             except ConfigError as error:
+                if str(error).startswith("valve."):
+                    raise
                 raise ConfigError(f"{source}: {error}") from error
             while len(_loaded) > _KEPT:
                 _loaded.pop(next(iter(_loaded)))

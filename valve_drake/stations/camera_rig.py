@@ -44,6 +44,8 @@ from valve_drake.robot.description import RobotDescription
 from valve_drake.stations.render_egl import FINE, RenderEngineEgl, add_renderer
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.simulation_config import CameraConfig, LightConfig, ValveConfig
+from valve_drake.valve.model import marker_frame
+from valve_drake.valve.valve import Valve
 
 ROLL = 0.17  # of the render against the image; only edges at this angle lie along the render's rows [rad]
 NEEDED = 2.0  # beyond what the map reads, so much is drawn as well [px of the render]
@@ -117,7 +119,7 @@ RENDERER = "cameras"  # its name in the rig's SceneGraph
 BACKGROUND = (0.80, 0.85, 0.90)
 # Up to which distance the edges of the valve's visuals are measured, by name [m]: the marker's always, those of the
 # handles' marks by the wrist cameras alone (of the head cameras' images, from farther off, only their middles count).
-FINE_WITHIN = {"marker": math.inf, "mark_1": 0.5, "mark_2": 0.5}
+FINE_WITHIN = {"marker": math.inf, **{f"mark_{k}": 0.5 for k in range(1, 13)}}
 
 
 Needed = Callable[[CameraInfo], np.ndarray]  # as of RenderEngineEgl
@@ -137,7 +139,7 @@ def _draw_finely(plant: MultibodyPlant, scene_graph: SceneGraph, valve: ModelIns
     """What is measured in images is drawn with many points a pixel, the rest with one. Before a renderer is added."""
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     assert source is not None  # the plant has its geometry there
-    body = plant.GetFrameByName("marker", valve).body()
+    body = marker_frame(plant, valve).body()
     measured = {
         id: FINE_WITHIN.get(inspector.GetName(id).split("::")[-1], 0.0) for id in plant.GetVisualGeometriesForBody(body)
     }
@@ -158,7 +160,7 @@ class CameraRig:
         self,
         mounts: Mapping[str, Mount],
         valve: ValveConfig,
-        marker_size: tuple[float, float],
+        shape: Valve,
         light: LightConfig,
         camera: CameraConfig,
         seed: int,
@@ -167,7 +169,7 @@ class CameraRig:
         builder = DiagramBuilder()
         self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1.0)
         scene_graph.set_name("scene_graph")
-        self.scene = add_scene(self.plant, valve, marker_size, robot)
+        self.scene = add_scene(self.plant, valve, shape, robot)
         self.plant.Finalize()
         _draw_finely(self.plant, scene_graph, self.scene.valve)
         self._lensed = {name: _Lensed(mount.lens) for name, mount in mounts.items()}
@@ -233,7 +235,7 @@ class CameraRig:
         """X_CV: where one camera truly has the marker (3, 4)."""
         self.pose(q)
         mount = self._mounts[name]
-        marker = self.plant.GetFrameByName("marker", self.scene.valve)
+        marker = marker_frame(self.plant, self.scene.valve)
         frame = self.plant.GetFrameByName(mount.frame, self.scene.robot)
         X_FV = self.plant.CalcRelativeTransform(self._plant_context, frame, marker)
         return compose(inverse(mount.X_FC), make(X_FV.rotation().matrix(), X_FV.translation()))

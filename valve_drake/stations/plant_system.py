@@ -37,6 +37,7 @@ from valve_drake.stations.contract import CONTRACT, vectors
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.servos import add_servos, ignore_touching
 from valve_drake.stations.simulation_config import ValveConfig
+from valve_drake.valve.valve import Valve
 
 STEPS = 2  # of the plant in a tick; twice as many leave forces and angles as they are and double the work
 COMMANDS = tuple(spec.name for spec in CONTRACT if spec.direction == "in")
@@ -82,7 +83,7 @@ class PlantSystem(PythonSystem):
     def __init__(
         self,
         valve: ValveConfig,
-        marker_size: tuple[float, float],
+        shape: Valve,
         start: Mapping[str, float],
         offsets: Mapping[str, np.ndarray],
         robot: Robot,
@@ -102,7 +103,7 @@ class PlantSystem(PythonSystem):
         self.plant, self.scene_graph = AddMultibodyPlant(config, builder)
         self.plant.set_name("plant")
         self.scene_graph.set_name("scene_graph")
-        scene = add_scene(self.plant, valve, marker_size, robot.description)
+        scene = add_scene(self.plant, valve, shape, robot.description)
         self.robot, self.valve = scene.robot, scene.valve
         add_servos(self.plant, self.robot, robot)
         self.plant.Finalize()
@@ -111,7 +112,7 @@ class PlantSystem(PythonSystem):
         for name, value in start.items():
             self.plant.GetJointByName(name, self.robot).set_default_positions([value])
         stem = self.plant.GetJointByName("stem", self.valve)
-        stem.set_default_positions([valve.bar_angle + max(valve.position, 0.0)])
+        stem.set_default_positions([valve.bar_angle + shape.sense * max(valve.position, 0.0)])
         still = builder.AddNamedSystem("valve_at_rest", ConstantVectorSource(np.zeros(2)))
         builder.Connect(still.get_output_port(), self.plant.get_desired_state_input_port(self.valve))
         builder.ExportInput(self.plant.get_desired_state_input_port(self.robot), "desired")

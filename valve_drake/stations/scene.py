@@ -4,19 +4,18 @@ physics and once each for the cameras and the 3D view, and by pictures in the do
 import dataclasses as dc
 
 import numpy as np
-from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
 from valve_drake import resources
-from valve_drake.frames import make, rot_y, rot_z
+from valve_drake.frames import make, rot_x, rot_y, rot_z
 from valve_drake.robot import description, model
 from valve_drake.robot.description import RobotDescription
 from valve_drake.stations.simulation_config import StartConfig, ValveConfig
+from valve_drake.valve.model import add_valve
+from valve_drake.valve.valve import Valve
 
-MARKER_RED = (0.80, 0.06, 0.05, 1.0)
-MARKER_THICKNESS = 1e-5  # a sticker: a plate would show its rim to a camera from above [m]
 SEIZED = 1e4  # friction of a valve that does not turn [N m]
 
 
@@ -44,6 +43,14 @@ def panel_pose(valve: ValveConfig) -> np.ndarray:
     return make(rot_z(valve.yaw) @ rot_y(valve.tilt) @ R0, np.array([0, 0, valve.height]))
 
 
+def _marker_offset(valve: ValveConfig) -> np.ndarray | None:
+    """X_VM: a marker that was stuck on by hand, in the place where it is believed to be (3, 4)."""
+    tilt, place = valve.marker_tilt, valve.marker_place
+    if not any((*tilt, *place)):
+        return None
+    return make(rot_x(tilt[0]) @ rot_y(tilt[1]) @ rot_z(tilt[2]), np.array([*place, 0.0]))
+
+
 def start_pose(start: StartConfig, valve: ValveConfig) -> np.ndarray:
     """Base (x, y, heading) in W -> (3,)."""
     bearing = valve.yaw + start.bearing
@@ -54,14 +61,14 @@ def start_pose(start: StartConfig, valve: ValveConfig) -> np.ndarray:
 def add_scene(
     plant: MultibodyPlant,
     valve: ValveConfig,
-    marker_size: tuple[float, float],
+    shape: Valve,
     robot: RobotDescription | None = None,
     *,
     laboratory: bool = True,
 ) -> Scene:
     """Adds everything to a plant that is not finalized. The valve's limits and friction are those of the config."""
     robot_model = add_robot(plant, robot)
-    valve_model = parse(plant, "valve")
+    valve_model = add_valve(plant, shape, _marker_offset(valve))
     X_WP = panel_pose(valve)
     plant.WeldFrames(  # mounts the panel in the room
         plant.world_frame(),
@@ -70,15 +77,10 @@ def add_scene(
     )
     if laboratory and (resources.models() / "laboratory" / "laboratory.sdf").is_file():
         parse(plant, "laboratory")
-    frame = plant.GetFrameByName("marker", valve_model)
-    X_LinkMarker = frame.GetFixedPoseInBodyFrame()
-    plate = RigidTransform([0, 0, MARKER_THICKNESS / 2])
-    plant.RegisterVisualGeometry(
-        frame.body(), X_LinkMarker @ plate, Box(*marker_size, MARKER_THICKNESS), "marker", np.array(MARKER_RED)
-    )
     stem = plant.GetJointByName("stem", valve_model)
     # The joint's zero is the bar level; closed is at bar_angle.
-    stem.set_position_limits([valve.bar_angle - valve.stop_play], [valve.bar_angle + valve.travel + valve.stop_play])
+    low, high = sorted([valve.bar_angle, valve.bar_angle + shape.sense * valve.travel])
+    stem.set_position_limits([low - valve.stop_play], [high + valve.stop_play])
     # Coulomb friction: a servo to zero speed that cannot exceed the friction torque.
     friction = plant.GetJointActuatorByName("stem", valve_model)
     friction.set_controller_gains(PdControllerGains(p=1e-4, d=1e5))

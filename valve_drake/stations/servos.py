@@ -6,7 +6,6 @@ from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
 from valve_drake.collision import CollisionModel
 from valve_drake.messages import SIDES
-from valve_drake.perception.marker import Marker
 from valve_drake.robot.robot import Robot
 
 FULL = 0.03  # a servo without gains in the file gives its full effort this far off; raise it if it shakes [rad, m]
@@ -50,6 +49,6 @@ def ignore_touching(plant: MultibodyPlant, scene_graph: SceneGraph, model: Model
     if not robot.description.collision.ignore:
         return
     filters = scene_graph.collision_filter_manager()
-    for pair in CollisionModel(robot, Marker()).ignored:
+    for pair in CollisionModel(robot).ignored:
         a, b = (GeometrySet(plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name, model))) for name in pair)
         filters.Apply(CollisionFilterDeclaration().ExcludeBetween(a, b))

@@ -28,6 +28,8 @@ from valve_drake.stations.contract import CAMERAS, TRUTH, check_contract
 from valve_drake.stations.plant_system import COMMANDS, PlantSystem
 from valve_drake.stations.scene import add_scene, panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig, ValveConfig
+from valve_drake.valve.model import marker_frame
+from valve_drake.valve.valve import Valve
 
 
 def _affine(gain: np.ndarray, offset: np.ndarray) -> AffineSystem:
@@ -157,7 +159,7 @@ class TruthSystem(PythonSystem):
 
     OUTPUTS = {"valve_angle": 2, "base_pose": 3, "marker_pose": 12, "stem_wrench": 6}
 
-    def __init__(self, physics: PlantSystem, valve: ValveConfig):
+    def __init__(self, physics: PlantSystem, valve: ValveConfig, sense: float):
         super().__init__()
         self.set_name("truth")
         plant = physics.plant
@@ -166,9 +168,9 @@ class TruthSystem(PythonSystem):
         stem = plant.GetJointByName("stem", physics.valve)
         self._q, self._v = stem.position_start(), plant.num_positions() + stem.velocity_start()
         self._base = [plant.GetJointByName(j, physics.robot).position_start() for j in physics.base]
-        self._bar_angle = valve.bar_angle
+        self._bar_angle, self._sense = valve.bar_angle, sense
         self._X_WP = panel_pose(valve)
-        X = plant.GetFrameByName("marker", physics.valve).GetFixedPoseInBodyFrame()
+        X = marker_frame(plant, physics.valve).GetFixedPoseInBodyFrame()
         self._X_LinkMarker = make(X.rotation().matrix(), X.translation())
         for name, size in self.OUTPUTS.items():
             source = self._load if name == "stem_wrench" else self._state
@@ -177,7 +179,8 @@ class TruthSystem(PythonSystem):
 
     def _calc_valve_angle(self, context: Context, output: BasicVector) -> None:
         state = self._state.Eval(context)
-        output.SetFromVector([state[self._q] - self._bar_angle, state[self._v]])
+        sense = self._sense
+        output.SetFromVector([sense * (state[self._q] - self._bar_angle), sense * state[self._v]])
 
     def _calc_base_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._state.Eval(context)[self._base])
@@ -225,14 +228,14 @@ def make_mounts(
 
 def rig_arguments(
     simulation: SimulationConfig,
-    marker_size: tuple[float, float],
+    shape: Valve,
     head: StereoHead,
     seed: int,
     robot: RobotDescription,
 ) -> tuple[Any, ...]:
     """The arguments of CameraRig, or of CameraWorkers, for the station's cameras."""
     mounts = make_mounts(head, simulation, seed, robot.cameras)
-    return mounts, simulation.valve, marker_size, simulation.light, simulation.camera, seed, robot
+    return mounts, simulation.valve, shape, simulation.light, simulation.camera, seed, robot
 
 
 def _select(physics: PlantSystem, joints: Sequence[str], what: str) -> np.ndarray:
@@ -264,7 +267,7 @@ class RobotStart:
 
 def make_plant(
     simulation: SimulationConfig,
-    marker_size: tuple[float, float],
+    shape: Valve,
     robot: Robot,
     seed: int,
     start: RobotStart | None = None,
@@ -278,12 +281,12 @@ def make_plant(
         start = RobotStart(start_pose(simulation.start, valve), robot.torso.home, home)
     arms = {side: q - offsets[side] for side, q in start.arms.items()}  # the start is what the encoders read
     at_start = robot.named(base=start.base, torso=start.torso, arms=arms, opening=robot.opening)
-    return PlantSystem(valve, marker_size, at_start, offsets, robot)
+    return PlantSystem(valve, shape, at_start, offsets, robot)
 
 
 def make_simulated_station(
     simulation: SimulationConfig,
-    marker_size: tuple[float, float],
+    shape: Valve,
     head: StereoHead,
     robot: Robot,
     seed: int,
@@ -299,7 +302,7 @@ def make_simulated_station(
     builder = DiagramBuilder()
     valve = simulation.valve
     offsets = arm_offsets(simulation.error, seed, robot)
-    physics = builder.AddSystem(make_plant(simulation, marker_size, robot, seed) if physics is None else physics)
+    physics = builder.AddSystem(make_plant(simulation, shape, robot, seed) if physics is None else physics)
     state, plant = physics.GetOutputPort("state"), physics.plant
     for name in COMMANDS:
         builder.ExportInput(physics.GetInputPort(name), name)
@@ -333,11 +336,7 @@ def make_simulated_station(
         builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
 
     camera = simulation.camera
-    images = (
-        CameraRig(*rig_arguments(simulation, marker_size, head, seed, robot.description))
-        if workers is None
-        else workers
-    )
+    images = CameraRig(*rig_arguments(simulation, shape, head, seed, robot.description)) if workers is None else workers
     positions = builder.AddSystem(MatrixGain(np.eye(plant.num_positions(), plant.num_multibody_states())))
     positions.set_name("positions")
     builder.Connect(state, positions.get_input_port())
@@ -350,7 +349,7 @@ def make_simulated_station(
     health = builder.AddSystem(HealthSystem())
     builder.ExportOutput(health.GetOutputPort("health"), "health")
 
-    truth = builder.AddSystem(TruthSystem(physics, valve))
+    truth = builder.AddSystem(TruthSystem(physics, valve, shape.sense))
     builder.Connect(state, truth.GetInputPort("state"))
     builder.Connect(physics.GetOutputPort("stem"), truth.GetInputPort("stem_load"))
     for name in TruthSystem.OUTPUTS:
@@ -358,7 +357,7 @@ def make_simulated_station(
     builder.ExportOutput(physics.GetOutputPort("contacts"), TRUTH + "contacts")
 
     if meshcat is not None:
-        view = _add_view(builder, positions.get_output_port(), valve, marker_size, meshcat, robot.description)
+        view = _add_view(builder, positions.get_output_port(), valve, shape, meshcat, robot.description)
         physics.view = view  # lives as long
     station = builder.Build()
     station.set_name("simulated")
@@ -370,7 +369,7 @@ def _add_view(
     builder: DiagramBuilder,
     positions: OutputPort,
     valve: ValveConfig,
-    marker_size: tuple[float, float],
+    shape: Valve,
     meshcat: Meshcat,
     robot: RobotDescription | None,
 ) -> MultibodyPlant:
@@ -378,7 +377,7 @@ def _add_view(
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
-    add_scene(plant, valve, marker_size, robot)
+    add_scene(plant, valve, shape, robot)
     plant.Finalize()
     poses = builder.AddNamedSystem("poses", MultibodyPositionToGeometryPose(plant))
     builder.Connect(positions, poses.get_input_port())

@@ -4,7 +4,7 @@ import dataclasses as dc
 import math
 
 from valve_drake.checks import require
-from valve_drake.config import Config, Number, choice, number, plain
+from valve_drake.config import Config, Number, choice, number, numbers, plain
 from valve_drake.ports import TICK
 
 
@@ -15,7 +15,9 @@ class ValveConfig(Config):
     KEY = "simulation.valve"
     height: Number = number(1.0, 0.5, 1.6, "of the axis over the floor [m]")
     yaw: Number = number(0.0, -1.0, 1.0, "of the panel [rad]")
-    tilt: Number = number(0.0, -0.4, 0.4, "of the panel; positive leans away from the robot at its top [rad]")
+    tilt: Number = number(
+        0.0, -0.4, 1.5708, "of the panel; positive leans away from the robot at its top, 1.5708 is flat [rad]"
+    )
     bar_angle: Number = number(
         0.0, -0.8, 0.8, "of the bar with the valve closed, from level, counter-clockwise for the robot [rad]"
     )
@@ -26,6 +28,10 @@ class ValveConfig(Config):
         -1.0, -1.0, 20.0, "opened so far at the start; -1: where the command has its work to do [rad]"
     )
     seized: bool = plain(False, "does not turn at all")
+    marker_place: list[float] = numbers(
+        [0.0, 0.0], -0.05, 0.05, "where the marker really is, off its place along x and y of V [m]"
+    )
+    marker_tilt: list[float] = numbers([0.0, 0.0, 0.0], -0.2, 0.2, "how it really lies, about x, y, z of V [rad]")
 
 
 @dc.dataclass

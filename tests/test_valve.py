@@ -1,0 +1,163 @@
+"""The valve as one value: what its keys refuse, its grasps and marks, its model in Drake."""
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import MultibodyPlant
+from robot_facts import ROBOT
+
+from valve_drake import scenario as scenarios
+from valve_drake.checks import ConfigError
+from valve_drake.collision import CollisionModel
+from valve_drake.frames import compose, inverse, make, rot_y, rot_z
+from valve_drake.robot import description
+from valve_drake.robot.robot import Robot
+from valve_drake.valve.model import add_valve, marker_frame
+from valve_drake.valve.valve import HandleConfig, Valve, heading, turned
+
+OURS = description.find(description.OURS)
+FACING = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # R of an upright valve straight ahead
+WHEEL = """
+valve:
+  model: ""
+  handles:
+  - {kind: rim, xyz: [0.15, 0, 0]}
+  - {kind: rim, xyz: [-0.075, 0.1299, 0]}
+  - {kind: rim, xyz: [-0.075, -0.1299, 0]}
+  spokes: 3
+"""
+
+
+def valve(text: str) -> Valve:
+    scenario = scenarios.parse(text, "a file")
+    scenario.check()
+    return scenario.valve
+
+
+HANDLES = "valve: {model: '', handles: [%s]}"
+GOOD = "{xyz: [0.15, 0, 0]}, {xyz: [-0.15, 0, 0]}"
+
+WRONG = {
+    "valve: {colour: red}": "unknown key valve.colour",
+    "valve: {marker: {sise: [0.1, 0.1]}}": "unknown key valve.marker.sise",
+    "valve: {marker: {size: [0.1]}}": "valve.marker.size must be 2 values",
+    "valve: {marker: {size: [98, 100]}}": "valve.marker.size[0] must be within [0.005, 2]",
+    "valve: {marker: {size: [0.1, 0.02]}}": "valve.marker.size must be of an aspect up to 3:1",
+    "valve: {marker: {size: [0.2, 0.2]}}": "valve.marker.size must be not larger than the face",
+    "valve: {marker: {xyz: [0, 0, 0.2]}}": "valve.marker.xyz must be before the panel",
+    "valve: {marker: {rpy: [1.2, 0, 0]}}": "valve.marker.rpy must be facing the robot",
+    "valve: {opens: left}": "valve.opens must be counter_clockwise or clockwise",
+    HANDLES % "{xyz: [0.15, 0, 0]}": "valve.handles must be 2 to 12 places",
+    HANDLES % (GOOD + ", {xyz: [0.15, 0]}"): "valve.handles[2].xyz must be 3 values",
+    HANDLES % (GOOD + ", {xyz: [0.02, 0, 0]}"): "valve.handles[2].xyz must be at least 0.05 m off the axis",
+    HANDLES % (GOOD + ", {xyz: [0.15, 0.1, 0.3]}"): "valve.handles[2].xyz must be before the panel",
+    HANDLES % (GOOD + ", {xyz: [0, 0.15, 0], kind: knob}"): "valve.handles[2].kind must be bar or lever or rim",
+    HANDLES % (GOOD + ", {xyz: [0, 0.15, 0], width: 0.2}"): "valve.handles[2].width must be within",
+    HANDLES % (GOOD + ", {xyz: [0, 0.15, 0], along: [0, 0, 1]}"): "valve.handles[2].along must be a direction across",
+    HANDLES % "{xyz: [0.15, 0, 0]}, {xyz: [0.14, 0.05, 0]}": "valve.handles must be two of them at least 0.12 m apart",
+    HANDLES % "{xyz: [0.15, 0, 0], kind: rim}, {xyz: [-0.2, 0, 0], kind: rim}": "as far from the axis as all others",
+    "valve: {handles: 3}": "valve.handles must be a list",
+    "valve: {panel: {depth: -1}}": "valve.panel.depth must be within",
+    "valve: {obstacles: [{size: [1, 1]}]}": "valve.obstacles[0].size must be 3 values",
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_a_wrong_valve_is_refused_in_one_line_that_names_the_key(text):
+    with pytest.raises(ConfigError) as error:
+        valve(text)
+    assert WRONG[text] in str(error.value) and "\n" not in str(error.value)
+
+
+MODELS = {
+    "valve: {model: nothing.sdf}": "valve.model: no such file: nothing.sdf",
+    "valve: {model: robot/robot.sdf}": "valve.model: stem must be a joint of the model",
+    "valve: {handles: [{xyz: [0.2, 0, 0]}, {xyz: [-0.15, 0, 0]}]}": "valve.handles[0].xyz must be where valve.model",
+    "valve: {marker: {xyz: [0.06, 0, -0.041]}}": "valve.marker.xyz must be where valve.model has its frame marker",
+    "valve: {panel: {depth: 0.12}}": "where valve.model has its frame",
+}
+
+
+@pytest.mark.parametrize("text", MODELS)
+def test_a_model_that_contradicts_the_keys_is_refused_in_one_line(text):
+    with pytest.raises(ConfigError) as error:
+        add_valve(MultibodyPlant(0.0), valve(text))
+    assert MODELS[text] in str(error.value) and "\n" not in str(error.value)
+
+
+def test_grasps_run_along_the_handle_and_close_across_it():
+    shape = valve(WHEEL)
+    for k, handle in enumerate(shape.handles):
+        for sign in (1.0, -1.0):
+            X_AG = shape.grasp(k, sign)
+            assert X_AG[:, :3].T @ X_AG[:, :3] == pytest.approx(np.eye(3)) and X_AG[2, 2] == 1
+            radial = np.array(handle.xyz) / 0.15
+            assert X_AG[:, 0] @ radial == pytest.approx(0, abs=1e-3)  # round the rim
+            assert abs(X_AG[:, 1] @ radial) == pytest.approx(1, abs=1e-3)  # the fingers are inside and outside of it
+
+
+def test_the_marks_of_our_valve_are_beside_its_marker():
+    target = Valve().target()
+    assert target.marks.tolist() == [[0.15, 0, 0.028], [-0.15, 0, 0.028]]
+    aside = valve("valve: {marker: {xyz: [0, 0.06, -0.041], rpy: [0, 0, 1.5707963267948966]}}").target()
+    assert aside.marks == pytest.approx(np.array([[-0.06, -0.15, 0.028], [-0.06, 0.15, 0.028]]))
+
+
+@pytest.mark.parametrize("text", ["", WHEEL])
+def test_a_model_has_its_frames_where_the_keys_say_and_handles_of_the_width(text):
+    """Fingers that are as far apart as a handle is wide touch it, and it turns under them about the axis."""
+    shape = valve(text)
+    robot = Robot.load(OURS, shape)
+    plant, model = robot.model.plant, robot.model.valve
+    context = plant.CreateDefaultContext()
+    axis = plant.GetFrameByName("valve_axis", model)
+    for angle in (0.0, 0.6):
+        plant.GetJointByName("stem", model).set_angle(context, angle)
+        X_PA = turned(inverse(shape.X_AP()), angle)
+        for k, handle in enumerate(shape.handles):
+            frame = plant.GetFrameByName(f"handle_{k + 1}", model)
+            X = plant.CalcRelativeTransform(context, axis, frame).GetAsMatrix34()
+            assert X == pytest.approx(compose(X_PA, make(np.eye(3), np.array(handle.xyz))), abs=1e-3)
+        X = plant.CalcRelativeTransform(context, axis, marker_frame(plant, model)).GetAsMatrix34()
+        assert X == pytest.approx(compose(X_PA, shape.X_AV()), abs=1e-9)
+    query = robot.model.scene_graph.get_query_output_port()
+    root = robot.model.diagram.CreateDefaultContext()
+    inner = plant.GetMyMutableContextFromRoot(root)
+    X_WP = plant.CalcRelativeTransform(inner, plant.world_frame(), axis).GetAsMatrix34()
+    found = query.Eval(robot.model.scene_graph.GetMyContextFromRoot(root))
+    wheel = set(plant.GetCollisionGeometriesForBody(plant.GetBodyByName("wheel", model)))
+    for k, handle in enumerate(shape.handles):
+        X_AG = shape.grasp(k, 1.0)
+        for side in (1.0, -1.0):
+            p_A = X_AG[:, 3] + X_AG[:, 1] * side * handle.width / 2
+            p_W = compose(X_WP, inverse(shape.X_AP()), make(np.eye(3), p_A))[:, 3]
+            near = [d for d in found.ComputeSignedDistanceToPoint(p_W, 0.02) if d.id_G in wheel]
+            assert min(abs(d.distance) for d in near) < 1e-3
+
+
+def test_obstacles_keep_the_arms_away_and_do_not_turn():
+    X_BA = make(FACING, np.array([0.72, 0.0, 1.0]))
+    text = "valve: {obstacles: [{xyz: [0.3, 0, -0.3], size: [0.2, 0.2, 0.4]}]}"
+    blocked = CollisionModel(Robot.load(OURS, valve(text)))
+    q = ROBOT.home.copy()
+    X_BG = make(FACING @ np.diag([-1.0, -1, 1]), np.array([0.45, -0.3, 1.0]))
+    q[6:] = ROBOT.inverse("right", X_BG, ROBOT.arms["right"].work)
+    assert CollisionModel(ROBOT).is_free(X_BA, q)
+    assert not blocked.is_free(X_BA, q) and "obstacle_1" in str(blocked.touching(X_BA, q))
+    assert not blocked.is_free(turned(X_BA, 1.0), q)  # the valve turned, the box has not
+    assert blocked.is_free(X_BA, ROBOT.home)
+
+
+def test_heading_is_that_of_the_axis_or_of_the_view_where_the_axis_is_upright():
+    viewer = np.array([0.0, 0.0])
+    for tilt in (0.0, 0.8):
+        X = make(rot_z(0.4) @ rot_y(tilt) @ FACING, np.array([2.0, 0.0, 1.0]))
+        assert heading(X, viewer) == pytest.approx(0.4)
+    X = make(rot_z(0.4) @ rot_y(np.pi / 2) @ FACING, np.array([2.0, 2.0, 0.8]))
+    assert heading(X, viewer) == pytest.approx(np.pi / 4)
+
+
+def test_handles_run_outwards_or_round_the_axis_unless_they_say_otherwise():
+    for kind, along in (("bar", [0.6, 0.8, 0]), ("lever", [0.6, 0.8, 0]), ("rim", [-0.8, 0.6, 0])):
+        assert HandleConfig(kind=kind, xyz=[0.09, 0.12, 0.0]).direction() == pytest.approx(along)
+    given = HandleConfig(xyz=[0.09, 0.12, 0.0], along=[0.0, 2.0, 0.0])
+    assert given.direction().tolist() == [0, 1, 0]

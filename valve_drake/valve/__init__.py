@@ -1,0 +1,1 @@
+"""The valve as one value, and its model in Drake."""

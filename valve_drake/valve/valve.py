@@ -1,0 +1,190 @@
+"""The valve as one value: its axis, its marker, where hands can hold it, what is fixed around it.
+
+All places are in the axis frame A: origin on the axis at the grip plane (the middle of what is gripped), z along the
+axis into the panel. A turns with the valve. Where A's x axis is level, the simulated stem stands at zero; positive
+turns are counter-clockwise as seen from the robot, about -z of A.
+
+A scenario's key `valve` brings another valve; its simulated scene, the collision model, the grasps, the estimator's
+marker and the turning law take everything from here.
+"""
+
+import dataclasses as dc
+import math
+
+import numpy as np
+
+from valve_drake.checks import require
+from valve_drake.config import Config, about, choice, number, numbers, plain
+from valve_drake.frames import compose, inverse, make, rot_x, rot_y, rot_z
+from valve_drake.perception.marker import Marker
+
+OPENING = {"counter_clockwise": 1.0, "clockwise": -1.0}  # sense that opens -> its sign about -z of A
+_UPRIGHT = 0.35  # horizontal part of an axis' direction below which it has no heading of its own
+
+
+@dc.dataclass
+class HandleConfig(Config):
+    """A place where a hand can hold the valve, with a green mark on its front."""
+
+    KEY = "valve.handles"
+    kind: str = choice(
+        "bar", ("bar", "lever", "rim"), "bar, lever: reaches out from the axis; rim: runs round the axis"
+    )
+    xyz: list[float] = numbers([0.15, 0.0, 0.0], -1.0, 1.0, "the middle of what is gripped, in A [m]")
+    along: list[float] = numbers(
+        [], -1.0, 1.0, "direction of the handle there, in A; none: outwards, of a rim round the axis", (0, 3)
+    )
+    width: float = number(0.025, 0.005, 0.08, "between the pads when grasped [m]")
+    length: float = number(0.06, 0.03, 1.0, "that is free for a hand, along the handle [m]")
+
+    def relations(self, key: str) -> None:
+        radius = math.hypot(*self.xyz[:2])
+        require(radius >= 0.05, f"{key}.xyz", "at least 0.05 m off the axis", self.xyz)
+        if self.along:
+            across = len(self.along) == 3 and math.hypot(*self.along[:2]) > 0.9 * math.hypot(*self.along) > 0
+            require(across, f"{key}.along", "a direction across the axis, three numbers", self.along)
+
+    def direction(self) -> np.ndarray:
+        """Unit vector along the handle, across the axis, in A -> (3,)."""
+        x, y, _ = self.along or ((-self.xyz[1], self.xyz[0], 0.0) if self.kind == "rim" else (*self.xyz[:2], 0.0))
+        return np.array([x, y, 0.0]) / math.hypot(x, y)
+
+
+@dc.dataclass
+class MarkerConfig(Config):
+    """The red rectangle."""
+
+    KEY = "valve.marker"
+    size: list[float] = numbers([0.098, 0.100], 0.005, 2.0, "2 X_w, 2 Y_w, along x and y of V [m]")
+    xyz: list[float] = numbers([0.0, 0.0, -0.041], -1.0, 1.0, "of its centre, in A [m]")
+    rpy: list[float] = numbers([0.0, 0.0, 0.0], -math.pi, math.pi, "roll, pitch, yaw of V in A [rad]")
+    face: float = number(0.15, 0.01, 2.0, "the valve's face that carries it, square [m]")
+    mark_height: float = number(0.013, 0.0, 0.2, "of the green marks over the middle of their handles [m]")
+
+    def relations(self, key: str) -> None:
+        for length in self.size:
+            words = f"not larger than the face on the valve, {key}.face, {self.face:g} m"
+            require(length <= self.face, f"{key}.size", words, self.size)
+        require(max(self.size) <= 3 * min(self.size), f"{key}.size", "of an aspect up to 3:1", self.size)
+        lean = math.acos(min(max(math.cos(self.rpy[0]) * math.cos(self.rpy[1]), -1.0), 1.0))
+        require(lean < 0.8, f"{key}.rpy", "facing the robot: leaning by at most 0.8 rad", self.rpy)
+
+
+@dc.dataclass
+class PanelConfig(Config):
+    """What carries the valve: a plate across the axis."""
+
+    KEY = "valve.panel"
+    depth: float = number(0.09, 0.02, 1.0, "of its front surface behind the grip plane [m]")
+    width: float = number(0.8, 0.05, 5.0, "[m]")
+    height: float = number(0.8, 0.05, 5.0, "[m]")
+
+
+@dc.dataclass
+class ObstacleConfig(Config):
+    """A box beside the valve that hands and arms keep clear of; it does not turn."""
+
+    KEY = "valve.obstacles"
+    xyz: list[float] = numbers([0.0, 0.0, 0.0], -5.0, 5.0, "of its centre, in A with the stem at zero [m]")
+    size: list[float] = numbers([0.1, 0.1, 0.1], 0.001, 10.0, "along x, y and z of A [m]")
+
+
+def _ends_of_the_bar() -> list[HandleConfig]:
+    return [HandleConfig(xyz=[x, 0.0, 0.0]) for x in (0.15, -0.15)]
+
+
+@dc.dataclass
+class Valve(Config):
+    """Scenario key `valve`."""
+
+    KEY = "valve"
+    model: str = plain(
+        "valve/valve.sdf",
+        'its shape: a path, one below models/, or a package:// URL; "": made of these keys',
+    )
+    opens: str = choice("counter_clockwise", tuple(OPENING), "the sense that opens it, as seen from the robot")
+    marker: MarkerConfig = dc.field(default_factory=MarkerConfig)
+    handles: list[HandleConfig] = dc.field(
+        default_factory=_ends_of_the_bar,
+        metadata=about("places where hands can hold it: kind, xyz, along, width, length"),
+    )
+    spokes: int = number(5, 0, 12, "of a rim that is made of these keys; none lies at a handle if handles lie between")
+    panel: PanelConfig = dc.field(default_factory=PanelConfig)
+    obstacles: list[ObstacleConfig] = dc.field(
+        default_factory=list, metadata=about("boxes that hands and arms keep clear of: xyz, size")
+    )
+
+    def relations(self, key: str) -> None:
+        handles = self.handles
+        require(2 <= len(handles) <= 12, f"{key}.handles", "2 to 12 places, one for each hand", len(handles))
+        require(len(self.obstacles) <= 20, f"{key}.obstacles", "at most 20 boxes", len(self.obstacles))
+        apart = max(math.dist(a.xyz, b.xyz) for a in handles for b in handles)
+        require(apart >= 0.12, f"{key}.handles", "two of them at least 0.12 m apart, for two hands", f"{apart:.3g} m")
+        for k, handle in enumerate(handles):
+            before = handle.xyz[2] < self.panel.depth
+            require(before, f"{key}.handles[{k}].xyz", f"before the panel, z below {self.panel.depth:g}", handle.xyz)
+        rims = [math.hypot(*handle.xyz[:2]) for handle in handles if handle.kind == "rim"]
+        round_ = not rims or max(rims) - min(rims) < 0.005
+        require(round_, f"{key}.handles", "as far from the axis as all others on the rim", [round(r, 4) for r in rims])
+        before = self.marker.xyz[2] < self.panel.depth
+        require(before, f"{key}.marker.xyz", f"before the panel, z below {self.panel.depth:g}", self.marker.xyz)
+
+    @property
+    def sense(self) -> float:
+        """1 if counter-clockwise opens, else -1."""
+        return OPENING[self.opens]
+
+    def X_AV(self) -> np.ndarray:
+        """The marker's frame in A -> (3, 4)."""
+        roll, pitch, yaw = self.marker.rpy
+        level = not any(self.marker.rpy)
+        R = np.eye(3) if level else rot_z(yaw) @ rot_y(pitch) @ rot_x(roll)
+        return make(R, np.array(self.marker.xyz))
+
+    def X_VA(self) -> np.ndarray:
+        return inverse(self.X_AV())
+
+    def X_AP(self) -> np.ndarray:
+        """The axis at the panel's surface, in A -> (3, 4)."""
+        return make(np.eye(3), np.array([0.0, 0.0, self.panel.depth]))
+
+    def target(self) -> Marker:
+        """What the head's cameras look for: the rectangle and the green marks, in V."""
+        X_VA, up = self.X_VA(), np.array([0.0, 0.0, -self.marker.mark_height])
+        marks = [X_VA[:, :3] @ (np.array(handle.xyz) + up) + X_VA[:, 3] for handle in self.handles]
+        return Marker(list(self.marker.size), np.round(np.array(marks), 12))
+
+    def grasp(self, handle: int, sign: float) -> np.ndarray:
+        """X_AG of a hand at a handle -> (3, 4): z_G into the panel, x_G along the handle, its direction times `sign`.
+
+        A parallel gripper holds the handle either way.
+        """
+        along, z = sign * self.handles[handle].direction(), np.array([0.0, 0.0, 1.0])
+        R = np.column_stack([along, [-along[1], along[0], 0.0], z])
+        return make(R + 0.0, np.array(self.handles[handle].xyz))
+
+    def radius(self, handle: int) -> np.ndarray:
+        """From the axis to a handle, across the axis, in A -> (2,) [m]."""
+        return np.array(self.handles[handle].xyz[:2])
+
+
+def heading(X_OA: np.ndarray, viewer: np.ndarray) -> float:
+    """The direction on the floor in which a robot faces the valve: that of the axis, into the panel.
+
+    An axis that is nearly upright has none: then it is the direction from the viewer's place (x, y) to the valve.
+    """
+    z = X_OA[:2, 2]
+    if math.hypot(*z) < _UPRIGHT:
+        z = X_OA[:2, 3] - viewer[:2]
+    return math.atan2(z[1], z[0])
+
+
+def turned(X_BA: np.ndarray, angle: float) -> np.ndarray:
+    """The axis frame after the valve turned by `angle` (positive: counter-clockwise as seen from the robot)."""
+    return compose(X_BA, make(rot_z(-angle), np.zeros(3)))
+
+
+def angle_turned(X_BA0: np.ndarray, X_BA1: np.ndarray) -> float:
+    """The angle turned from pose 0 to pose 1 about the common axis, in (-pi, pi]."""
+    R = X_BA0[:, :3].T @ X_BA1[:, :3]
+    return float(-np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
