@@ -74,7 +74,9 @@ def say(text: str, speaker: Speaker) -> np.ndarray:
 
 def _trimmed(sound: np.ndarray) -> np.ndarray:
     """Without the quieter ends (40 dB below the peak), 20 ms of them kept."""
-    loud = np.flatnonzero(np.abs(sound) > 0.01 * np.abs(sound).max()) if len(sound) else []
+    if len(sound) == 0:
+        return sound
+    loud = np.flatnonzero(np.abs(sound) > 0.01 * np.abs(sound).max())
     edge = RATE // 50
     return sound[max(loud[0] - edge, 0) : loud[-1] + edge] if len(loud) else sound[:0]
 
@@ -171,7 +173,9 @@ def _kokoro(text: str, who: Speaker) -> tuple[np.ndarray, int]:
     style = styles[names[0]]
     if len(names) == 3:
         style = float(names[1]) * style + (1 - float(names[1])) * styles[names[2]]
-    tokens = [vocabulary[c] for sentence in _hibari_model().phonemize(_plain(text)) for c in sentence if c in vocabulary]
+    tokens = [
+        vocabulary[c] for sentence in _hibari_model().phonemize(_plain(text)) for c in sentence if c in vocabulary
+    ]
     tokens = tokens[:500]
     given = {
         "tokens": np.array([[0, *tokens, 0]], np.int64),

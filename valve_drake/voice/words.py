@@ -56,9 +56,7 @@ def labels(text: str) -> list[int]:
     words = [word for word in "".join(c if c.isalpha() else " " for c in text.lower()).split()]
     foreign = [word not in INDEX for word in words]
     while True:
-        grown = [
-            foreign[k] or (word in WEAK and any(foreign[max(k - 1, 0) : k + 2])) for k, word in enumerate(words)
-        ]
+        grown = [foreign[k] or (word in WEAK and any(foreign[max(k - 1, 0) : k + 2])) for k, word in enumerate(words)]
         if grown == foreign:
             break
         foreign = grown

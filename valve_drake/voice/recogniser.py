@@ -1,0 +1,316 @@
+"""Sound of a radio to the sentences of the operator's grammar, while it is spoken.
+
+    80 ms of sound -> 96 numbers (embedding) -> which word has just been said, as probabilities (WordNet)
+    -> sentences, or none of them (`step`) -> grammar.Heard
+
+A word's probability is a short spike near its end; all other time is BLANK, and words that are not ours are OTHER. So
+the probability that a stretch of sound is one sentence and nothing else is a sum over all places of its spikes (the
+forward recursion of connectionist temporal classification). A sentence counts for what it is within all that could
+have been said, not for what it is beside the other sentences of the grammar: speech that was not meant for the robot
+is refused by that. `stop` does not wait for the end of a sentence, nor for its beginning; `confirm` not for the end.
+"""
+
+import dataclasses as dc
+import functools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from valve_drake import resources
+from valve_drake.checks import ConfigError, require
+from valve_drake.operator import grammar
+from valve_drake.operator.grammar import SURE, Heard
+from valve_drake.voice.embedding import BLOCK, ROW, STEP, Stream
+from valve_drake.voice.radio import RATE
+from valve_drake.voice.words import BLANK, CLASSES, INDEX, OTHER, WORDS, spelt
+
+# Words without which a sentence means the same; they may stand anywhere, or be missed.
+FILLERS = ("the", "by", "please", "now", "and", "way")
+PAUSE = 10  # steps without a word that end a sentence: 0.8 s; raise it for speakers who halt between words
+LONGEST = 100  # steps of a sentence: 8 s
+STOP_SURE = 0.5  # probability from which `stop` is heard; lower: fewer are missed, more are heard in other words
+SENTENCE_SURE = 0.2  # of a whole sentence; lower: fewer are refused, more other speech is taken for one
+DEAF = 6  # steps after a `stop` or `confirm` in which the same word is not heard again
+_EARLY = 0.1  # probability of `confirm` from which it is asked whether the sentence is no more than that
+
+
+# ---------------------------------------------------------------- sound to words
+
+
+@dc.dataclass(frozen=True)
+class WordNet:
+    """A small network: the last `span` rows of the embedding -> the probability of each class.
+
+    weights, biases: of three layers, (span * ROW, h1), (h1, h2), (h2, CLASSES). mean, scale: of a row's numbers,
+    (ROW,). silence: the row of digital silence, standardised, which stands before the first.
+    """
+
+    span: int
+    mean: np.ndarray
+    scale: np.ndarray
+    silence: np.ndarray
+    weights: tuple[np.ndarray, np.ndarray, np.ndarray]
+    biases: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    @staticmethod
+    def load(path: Path | None = None) -> "WordNet":
+        """path: None: the one that comes with the program. Raises ConfigError where it is no such file."""
+        path = path or resources.models() / "voice" / "words.npz"
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                made = {name: file[name].astype(np.float32) for name in file.files if name != "words"}
+                words = tuple(file["words"].tolist())
+            layers = range(1, 4)
+            net = WordNet(
+                int(made["span"]),
+                made["mean"],
+                made["scale"],
+                made["silence"],
+                tuple(made[f"weights_{k}"] for k in layers),  # type: ignore[arg-type]
+                tuple(made[f"biases_{k}"] for k in layers),  # type: ignore[arg-type]
+            )
+        except (OSError, ValueError, KeyError, EOFError) as e:
+            raise ConfigError(f"not a word network: {path} ({type(e).__name__})") from None
+        require(words == WORDS, f"words of {path}", "those of valve_drake.voice.words", words)
+        return net
+
+    def save(self, path: Path) -> None:
+        arrays: dict[str, Any] = {f"weights_{k + 1}": w.astype(np.float16) for k, w in enumerate(self.weights)}
+        arrays |= {f"biases_{k + 1}": b.astype(np.float32) for k, b in enumerate(self.biases)}
+        arrays |= {"mean": self.mean, "scale": self.scale, "silence": self.silence, "span": np.array(self.span)}
+        np.savez(path, words=np.array(WORDS), **arrays)
+
+    def probabilities(self, rows: np.ndarray) -> np.ndarray:
+        """Rows since the beginning of a stream (n, ROW) -> (n, CLASSES)."""
+        x = np.concatenate([np.tile(self.silence, (self.span - 1, 1)), (rows - self.mean) / self.scale])
+        n = len(rows)
+        return self._classes(np.concatenate([x[k : k + n] for k in range(self.span)], 1))
+
+    def start(self) -> Callable[[np.ndarray], np.ndarray]:
+        """A stream's network: the next row (ROW,) -> (CLASSES,)."""
+        last = np.tile(self.silence, (self.span, 1)).astype(np.float32)
+
+        def push(row: np.ndarray) -> np.ndarray:
+            last[:-1] = last[1:].copy()
+            last[-1] = (row - self.mean) / self.scale
+            return self._classes(last.reshape(1, -1))[0]
+
+        return push
+
+    def _classes(self, x: np.ndarray) -> np.ndarray:
+        for k in (0, 1):
+            x = np.maximum(x @ self.weights[k] + self.biases[k], 0)
+        x = x @ self.weights[2] + self.biases[2]
+        e = np.exp(x - x.max(1, keepdims=True))
+        return e / e.sum(1, keepdims=True)
+
+
+# ---------------------------------------------------------------- words to sentences
+
+
+@dc.dataclass(frozen=True)
+class Sentences:
+    """Sentences that are listened for. texts: as the grammar reads them. classes: of their words (n, most), 0 beyond
+    the end. lengths: (n,). meanings: (n,) int, equal for those that mean the same."""
+
+    texts: tuple[str, ...]
+    classes: np.ndarray
+    lengths: np.ndarray
+    meanings: np.ndarray
+
+    @staticmethod
+    def of(texts: list[str]) -> "Sentences":
+        """Words beside the vocabulary must not stand in them; numbers are in digits."""
+        spoken = []
+        for text in texts:
+            words = " ".join(spelt(int(w)) if w.isdigit() else w for w in text.split()).split()
+            spoken.append([INDEX[word] for word in words if word not in FILLERS])
+        classes = np.zeros((len(texts), max(map(len, spoken))), int)
+        for k, row in enumerate(spoken):
+            classes[k, : len(row)] = row
+        numbers: dict[tuple[object, ...], int] = {}
+        meant = [grammar.parse(text) for text in texts]
+        keys = [(i.kind, round(i.angle, 6), i.awake) for i in meant]
+        meanings = np.array([numbers.setdefault(key, len(numbers)) for key in keys])
+        return Sentences(tuple(texts), classes, np.array([len(row) for row in spoken]), meanings)
+
+
+@functools.cache
+def whole_grammar() -> Sentences:
+    """Every sentence of grammar.PHRASES but those with `stop`, each with and without the wake phrase."""
+    texts = []
+    for phrase, kind in grammar.PHRASES.items():
+        if kind == grammar.Kind.STOP:
+            continue
+        for n in grammar.NUMBERS if "<N>" in phrase else (0,):
+            text = phrase.replace("<N>", str(n))
+            texts += [text] if kind == grammar.Kind.WAKE else [text, f"{grammar.WAKE} {text}"]
+            if kind in grammar.MOVES and phrase.count(" "):  # "open the valve half", "open the valve by 20 degrees"
+                verb, rest = text.split(" ", 1)
+                if not rest.startswith("the"):
+                    texts += [f"{verb} the valve {rest}", f"{grammar.WAKE} {verb} the valve {rest}"]
+    return Sentences.of(list(dict.fromkeys(texts)))
+
+
+@functools.cache
+def _confirms() -> Sentences:
+    return Sentences.of(["confirm", f"{grammar.WAKE} confirm"])
+
+
+def sentence_probabilities(p: np.ndarray, sentences: Sentences) -> np.ndarray:
+    """Probabilities of classes (steps, CLASSES) -> that each sentence, and nothing else, was said (n,)."""
+    p = np.asarray(p, float)
+    blank = p[:, BLANK] + p[:, [INDEX[word] for word in FILLERS]].sum(1)
+    n, most = sentences.classes.shape
+    states = np.zeros((n, 2 * most + 1), int)
+    states[:, 1::2] = sentences.classes
+    real = states > 0
+    emitted = np.where(real[None], p[:, states], blank[:, None, None])  # (steps, n, states)
+    jumps = np.zeros((n, 2 * most + 1))  # a blank may be left out between two different words
+    jumps[:, 3::2] = states[:, 3::2] != states[:, 1:-2:2]
+    a = np.zeros((n, 2 * most + 1))
+    a[:, :2] = 1.0
+    a[:, :2] *= emitted[0, :, :2]
+    for step in emitted[1:]:
+        b = a.copy()
+        b[:, 1:] += a[:, :-1]
+        b[:, 2:] += jumps[:, 2:] * a[:, :-2]
+        a = b * step
+    last = 2 * sentences.lengths
+    rows = np.arange(n)
+    return a[rows, last] + a[rows, last - 1]
+
+
+def best_sentence(p: np.ndarray, sentences: Sentences) -> tuple[str, float]:
+    """The likeliest meaning's likeliest sentence, and the meaning's probability."""
+    each = sentence_probabilities(p, sentences)
+    of_meaning = np.bincount(sentences.meanings, each)
+    meaning = int(of_meaning.argmax())
+    best = int(np.where(sentences.meanings == meaning, each, -1.0).argmax())
+    return sentences.texts[best], float(min(of_meaning[meaning], 1.0))
+
+
+def transcript(p: np.ndarray) -> str:
+    """The likeliest word of each step, words that are not ours as "..."."""
+    out: list[str] = []
+    before = BLANK
+    for c in p.argmax(1).tolist():
+        if c not in (before, BLANK) and not (c == OTHER and out[-1:] == ["..."]):
+            out.append("..." if c == OTHER else WORDS[c - 2])
+        before = c
+    return " ".join(out)
+
+
+def score(probability: float, sure: float) -> float:
+    """A probability on the scale of grammar.Heard, where `sure` is SURE; 0 and 1 stay."""
+    if probability <= 0.0:
+        return 0.0
+    return min(probability, 1.0) ** (math.log(SURE) / math.log(sure)) if sure != SURE else min(probability, 1.0)
+
+
+def _without(p: np.ndarray, words: list[str]) -> np.ndarray:
+    """The probabilities (CLASSES,) with those of these words given to BLANK."""
+    if not words:
+        return p
+    p = p.copy()
+    for word in words:
+        p[BLANK] += p[INDEX[word]]
+        p[INDEX[word]] = 0.0
+    return p
+
+
+@dc.dataclass(frozen=True)
+class Memory:
+    """time: steps so far. said: the probabilities since the sentence began, oldest first; empty: nobody speaks.
+
+    quiet: steps since the last word. before: the probabilities of the last step. deaf: steps for which `stop` and
+    `confirm` are not heard again.
+    """
+
+    time: int = 0
+    said: tuple[np.ndarray, ...] = ()
+    quiet: int = 0
+    before: np.ndarray | None = None
+    deaf: tuple[int, int] = (0, 0)
+
+
+def step(m: Memory, p: np.ndarray) -> tuple[Memory, tuple[Heard, ...]]:
+    """The probabilities of the next 80 ms (CLASSES,) -> what was heard in them. begin and end: [s] of the stream."""
+    deaf_stop, deaf_confirm = (max(d - 1, 0) for d in m.deaf)
+    p = _without(p, [word for word, deaf in (("stop", deaf_stop), ("confirm", deaf_confirm)) if deaf])
+    before = p if m.before is None else m.before
+    idle = p[BLANK] + sum(p[INDEX[word]] for word in FILLERS) > 0.5
+    said = (*m.said, p) if m.said or not idle else ()
+    quiet = m.quiet + 1 if idle else 0
+    time = m.time + 1
+    end = (time - quiet) * STEP
+    begin = (time - max(len(said), 1)) * STEP
+
+    def spike(word: str) -> float:  # said in this step or in the last one, once
+        return float(1 - (1 - p[INDEX[word]]) * (1 - before[INDEX[word]]))
+
+    out: list[Heard] = []
+    stop = spike("stop")
+    if stop >= STOP_SURE:
+        out.append(Heard("stop", score(stop, STOP_SURE), begin, time * STEP))
+        said, quiet, deaf_stop = (), 0, DEAF
+    elif spike("confirm") > _EARLY and said:
+        text, probability = best_sentence(np.stack(said), _confirms())
+        if probability >= SENTENCE_SURE:
+            out.append(Heard(text, score(probability, SENTENCE_SURE), begin, time * STEP))
+            said, quiet, deaf_confirm = (), 0, DEAF
+    if said and (quiet >= PAUSE or len(said) >= LONGEST):
+        words = np.stack(said)
+        heard = transcript(words)
+        if heard.strip(". "):
+            text, probability = best_sentence(words, whole_grammar())
+            sure = probability >= SENTENCE_SURE
+            out.append(Heard(text if sure else heard, score(probability, SENTENCE_SURE), begin, end))
+        said, quiet = (), 0
+    return Memory(time, said, quiet, p, (deaf_stop, deaf_confirm)), tuple(out)
+
+
+# ---------------------------------------------------------------- the whole, on a stream
+
+
+class Recogniser:
+    """Hears a stream of sound: pieces of any length, 16-bit samples at RATE. The same samples give the same words.
+
+    Raises ConfigError where pyopen-wakeword is not installed.
+    """
+
+    def __init__(self, net: WordNet | None = None) -> None:
+        self._stream, self._net = Stream(), (net or WordNet.load()).start()
+        self._rest = np.zeros(0, np.int16)
+        self._memory = Memory()
+        self.probabilities = np.zeros(CLASSES, np.float32)  # of the newest step: scores for a log
+        self.probabilities[BLANK] = 1.0
+
+    @property
+    def time(self) -> float:
+        """How much sound was heard [s]."""
+        return self._memory.time * STEP
+
+    def push(self, samples: np.ndarray) -> list[Heard]:
+        """(n,) int16 -> what was heard in them; begin and end in seconds since the first sample."""
+        rest = np.concatenate([self._rest, np.asarray(samples, np.int16)])
+        out: list[Heard] = []
+        used = 0
+        while len(rest) - used >= BLOCK:
+            self.probabilities = self._net(self._stream.push(rest[used : used + BLOCK]))
+            self._memory, heard = step(self._memory, self.probabilities)
+            out += heard
+            used += BLOCK
+        self._rest = rest[used:].copy()
+        return out
+
+
+def hear(samples: np.ndarray, net: WordNet | None = None) -> list[Heard]:
+    """What is heard in a whole sound (n,) int16, a second of silence after it."""
+    return Recogniser(net).push(np.concatenate([samples, np.zeros(RATE + BLOCK, np.int16)]))
+
+
+__all__ = ["ROW", "Heard", "Memory", "Recogniser", "Sentences", "WordNet", "hear", "step", "whole_grammar"]
