@@ -10,7 +10,7 @@ from robot_facts import GROUPS
 from valve_drake.analysis import integrity
 from valve_drake.analysis.metrics import summarize
 from valve_drake.analysis.traces import Traces, interpolate
-from valve_drake.messages import Mode
+from valve_drake.messages import Mode, ModeState
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recorder_system import ONCE
 from valve_drake.recording.schemas import Vector
@@ -264,3 +264,16 @@ def test_the_tables_of_rates_agree_with_the_recorders_own():
         if row.key is None and all(isinstance(kind, int) for kind in row.inputs.values()) and row.period != ONCE
     }
     assert integrity.PERIODS == exact
+
+
+def test_in_a_log_of_several_runs_truth_counts_from_the_last_ones_beginning(tmp_path):
+    modes = ("idle", "search", "turn", "stopped", "idle", "search", "turn", "done")
+    names = {"/truth/valve_angle": 2, "/truth/base_pose": 3, "/truth/marker_pose": 12}
+    with LogWriter(tmp_path / "two.mcap") as writer:
+        for k, mode in enumerate(modes):
+            state = ModeState(time=float(k), mode=mode, activation=k, since=float(k), turn_angle=-0.5)
+            writer.write("/supervisor/mode", state, float(k))
+            for topic, size in names.items():
+                values = np.full(size, 0.1 * k if topic == "/truth/valve_angle" else 0.0)
+                writer.write(topic, Vector(float(k), tuple("abcdefghijkl"[:size]), values), float(k))
+    assert summarize(tmp_path / "two.mcap").angle_true_rad == pytest.approx(0.7 - 0.5)

@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import functools
+import itertools
 import os
 
 import numpy as np
@@ -124,7 +125,7 @@ def summarize(log: str | os.PathLike[str] | LogReader | Traces) -> Summary:
     if log.spans and log.spans[-1].mode in TERMINAL:
         out.outcome = log.spans[-1].mode
     out.angle_camera_rad = log.verify_angle
-    out.angle_true_rad = float(log.truth.angle[-1]) if log.truth is not None else None
+    out.angle_true_rad = _true_angle(log)
     for part in (_turning, _contacts, _estimates, _servo, _joints, _health):
         log.attempt(part.__name__.removeprefix("_"), functools.partial(part, log, out), None)
     out.faults = log.faults
@@ -136,6 +137,16 @@ def summarize(log: str | os.PathLike[str] | LogReader | Traces) -> Summary:
             did["tripped"],
         )
     return out
+
+
+def _true_angle(log: Traces) -> float | None:
+    """Turned since the last run began: a log of an operator's session holds several [rad]."""
+    if log.truth is None:
+        return None
+    begun = [after.start for before, after in itertools.pairwise(log.spans) if before.mode == Mode.IDLE]
+    angle = log.truth.angle
+    before = float(np.interp(begun[-1], log.truth.time, angle)) if len(begun) > 1 else 0.0
+    return float(angle[-1]) - before
 
 
 def _health(log: Traces, out: Summary) -> None:

@@ -20,6 +20,7 @@ from valve_drake.stations.lcm_channels import AUDIO, CONTROLLER, OPERATOR, WORDS
 from valve_drake.stations.reports import PRESENT
 
 SILENT = 1.0  # a program that was not heard for longer is gone [s]
+MOST = 64  # messages that are taken in at once
 PATIENCE = 3.0  # words that were not taken within this time are given up [s]
 
 
@@ -96,8 +97,9 @@ class DeskLink:
 
     def poll(self) -> None:
         """Takes in what has arrived, and says what is due."""
-        while self.bus.pump():
-            pass
+        for _ in range(MOST):
+            if not self.bus.pump():
+                break
         now = self.clock()
         if self.program and not self.linked:
             self.program = 0

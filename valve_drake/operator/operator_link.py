@@ -58,8 +58,9 @@ class OperatorLink:
 
     def take(self, time: float) -> OperatorPackets | None:
         """What has arrived since the last time, at `time` of the diagram; None: nothing."""
-        while self.bus.pump():
-            pass
+        for _ in range(MOST):  # who floods the bus must not hold the run up
+            if not self.bus.pump():
+                break
         if not self._packets:
             return None
         self._count += 1
