@@ -7,6 +7,7 @@ from robot_facts import ROBOT
 from robot_variants import variant
 
 from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances, standoff
+from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import SIDES
@@ -142,3 +143,31 @@ def test_what_touches_at_home_may_touch_if_the_robot_says_so(tmp_path):
         inwards[[1, 7]] = -0.3, 0.3
         assert not model.is_free(None, inwards)  # other parts of the arms
     assert free == {"": False, "touching_at_home": True}
+
+
+SRDF = """<robot name="r">
+  <disable_collisions link1="left_forearm" link2="right_forearm" reason="Never"/>
+  <disable_collisions link1="left_hand" link2="no_such_link" reason="Never"/>
+</robot>"""
+
+
+def test_the_pairs_of_an_srdf_are_not_looked_at(tmp_path):
+    crossed = np.zeros(12)
+    crossed[[1, 7]] = -0.3, 0.3
+    touching = {}
+    for name, text in (("without", "<robot/>"), ("with", SRDF)):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "r.srdf").write_text(text)
+        robot = Robot.load(variant(folder, change=lambda given: given.update(collision={"srdf": "r.srdf"})))
+        model = CollisionModel(robot)
+        touching[name] = {frozenset((model._link(p.id_A), model._link(p.id_B))) for p in model._near(None, crossed)}
+    forearms = frozenset({"left_forearm", "right_forearm"})
+    assert touching["without"] - touching["with"] == {forearms}
+
+
+def test_a_file_that_is_no_srdf_is_refused_in_one_line(tmp_path):
+    (tmp_path / "r.srdf").write_text("no xml")
+    robot = Robot.load(variant(tmp_path, change=lambda given: given.update(collision={"srdf": "r.srdf"})))
+    with pytest.raises(ConfigError, match="collision.srdf must be an SRDF file, got 'r.srdf'"):
+        CollisionModel(robot)

@@ -16,6 +16,8 @@ from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, compose, inverse, make, planar, rotation, wrap
 from valve_drake.messages import SIDES
+from valve_drake.robot import description
+from valve_drake.robot.robot import Robot
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
 from valve_drake.valve.valve import Valve, angle_turned, turned
@@ -203,3 +205,14 @@ def test_arms_that_touch_something_where_they_draw_back_have_no_stance():
     blocked = stances(lambda X_BA, q, posture=None: not np.allclose(q, back))
     assert arc.margin > 0.5
     assert blocked.check_arc(X_BA, np.pi / 2, arc.grasps).margin == -1
+
+
+def test_a_redundant_arm_that_is_not_comfortable_begins_from_other_postures_too():
+    pr2 = Robot.load(description.find("pr2/pr2.robot.yaml"))
+    X_OA = compose(panel_pose(ValveConfig(height=1.22)), inverse(VALVE.X_AP()))
+    X_BA, high = compose(inverse(planar(-0.88, 0, 0)), X_OA), pr2.posture.high
+    search = Stances(pr2, VALVE, CONFIG, VIEW, lambda *_: True)
+    arc = search.best_arc(X_BA, np.pi / 2, posture=high)
+    angles = np.linspace(0, np.pi / 2, 7)
+    first = [min(search._follow(X_BA, angles, side, arc.grasps[side], None, -1.0, high)[1]) for side in SIDES]
+    assert min(first) < 0.2 < 0.25 < arc.margin

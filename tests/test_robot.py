@@ -295,6 +295,12 @@ def test_the_pr2_is_described_by_its_file():
         gripper, arm = robot.grippers[side], robot.arms[side]
         assert gripper.openings[[0, -1]] == pytest.approx([0.0, 0.0938], abs=5e-4)  # a rotary linkage: no straight line
         assert gripper.opening(0.274) - gripper.openings[-1] / 2 > 1e-3
+        for opening in (0.01, 0.05, 0.085):
+            assert gripper.opening(gripper.position(opening)) == pytest.approx(opening, abs=1e-6)
+            q = gripper.position(opening)
+            slope = (gripper.opening(q + 1e-3) - gripper.opening(q - 1e-3)) / 2e-3
+            assert 2 * gripper.lever(q) == pytest.approx(slope, rel=5e-3)  # effort of the joint per force
+        assert gripper.position(-0.01) == pytest.approx(-0.01 / (2 * gripper.lever(0.0)))  # shut, it presses
         assert len(arm) == 7 and np.isinf(arm.high).sum() == 2  # forearm and wrist turn round and round
         assert robot.hands[side].mass == 0  # its springs carry it
         X = robot.forward(side, arm.work)

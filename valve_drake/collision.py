@@ -1,13 +1,27 @@
 """Do the arms touch anything? A model of robot, valve and panel for planning, apart from the simulated plant."""
 
 import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, QueryObject, SignedDistancePair
+from pydrake.geometry import (
+    CollisionFilterDeclaration,
+    CollisionFilterManager,
+    GeometryId,
+    GeometrySet,
+    QueryObject,
+    SignedDistancePair,
+)
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
 
+from valve_drake.checks import ConfigError, shown
 from valve_drake.frames import compose
 from valve_drake.messages import SIDES
+from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
 from valve_drake.valve.valve import turned
 
@@ -23,18 +37,45 @@ def stem_angle(X_BA: np.ndarray) -> float:
     return math.atan2(x, -y) if math.hypot(x, y) > 0.3 else 0.0
 
 
+def srdf_pairs(path: Path) -> set[tuple[str, str]]:
+    """The pairs of links that an SRDF file says need no check. Raises ConfigError if it is no such file."""
+    try:
+        found = list(ElementTree.parse(path).getroot().iter("disable_collisions"))
+    except (OSError, ElementTree.ParseError, ValueError) as error:
+        raise ConfigError(
+            f"collision.srdf must be an SRDF file, got {shown(path.name)}: {shown(str(error))}"
+        ) from error
+    return {(pair.get("link1", ""), pair.get("link2", "")) for pair in found}
+
+
+def exclude(
+    plant: MultibodyPlant,
+    filters: CollisionFilterManager,
+    model: ModelInstanceIndex,
+    pairs: Iterable[tuple[str, str]],
+) -> None:
+    """The shapes of these pairs of the model's links are not looked at from now on."""
+
+    def shapes(link: str) -> GeometrySet:
+        return GeometrySet(plant.GetCollisionGeometriesForBody(plant.GetBodyByName(link, model)))
+
+    for a, b in sorted(pairs):
+        filters.Apply(CollisionFilterDeclaration().ExcludeBetween(shapes(a), shapes(b)))
+
+
 class CollisionModel:
     """Robot at its base's origin, head at home, lift and waist as asked; the valve of its model can be anywhere.
 
     The panel stays level while the valve turns: the stem's angle is that of A's x axis against the horizontal.
 
-    ignored: pairs of links that may touch, since they do at home (robot.yaml's `collision.ignore`).
+    ignored: pairs of links that may touch (robot.yaml's `collision`).
     clearance: least distance that counts as free; a larger one forbids poses near the valve [m]; None: the robot's.
     opening: of both grippers [m]; None: the robot's.
     """
 
     def __init__(self, robot: Robot, clearance: float | None = None, opening: float | None = None):
         shared = robot.model
+        self._robot = shared.robot
         self._plant, self._scene_graph, self._valve = shared.plant, shared.scene_graph, shared.valve
         self._root = shared.diagram.CreateDefaultContext()
         self._context = self._plant.GetMyMutableContextFromRoot(self._root)
@@ -45,23 +86,24 @@ class CollisionModel:
         self._posture = robot.slots(robot.posture.names)
         self._rest = robot.rest(robot.opening if opening is None else opening)
         self.ignored: set[tuple[str, str]] = set()
-        if robot.description.collision.ignore:
-            self._ignore(self._near(None, robot.home))
+        described = robot.description.collision
+        if described.srdf:
+            path = description.find_file(described.srdf, "collision.srdf")
+            plant, model = self._plant, shared.robot
+            self._ignore({pair for pair in srdf_pairs(path) if all(plant.HasBodyNamed(name, model) for name in pair)})
+        if described.ignore:
+            self._ignore({(self._link(pair.id_A), self._link(pair.id_B)) for pair in self._near(None, robot.home)})
 
-    def _ignore(self, pairs: list[SignedDistancePair]) -> None:
-        """These pairs of shapes may touch from now on."""
-        inspector = self._scene_graph.model_inspector()
+    def _link(self, shape: GeometryId) -> str:
+        frame = self._scene_graph.model_inspector().GetFrameId(shape)
+        name: str = self._plant.GetBodyFromFrameId(frame).name()
+        return name
 
-        def link(shape: GeometryId) -> str:
-            body = self._plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
-            name: str = body.name()
-            return name
-
-        self.ignored = {(link(pair.id_A), link(pair.id_B)) for pair in pairs}
-        filters = self._scene_graph.collision_filter_manager(self._scene_graph.GetMyMutableContextFromRoot(self._root))
-        for pair in pairs:
-            both = GeometrySet(pair.id_A), GeometrySet(pair.id_B)
-            filters.Apply(CollisionFilterDeclaration().ExcludeBetween(*both))
+    def _ignore(self, pairs: set[tuple[str, str]]) -> None:
+        """These pairs of links may touch from now on."""
+        self.ignored |= pairs
+        root = self._scene_graph.GetMyMutableContextFromRoot(self._root)
+        exclude(self._plant, self._scene_graph.collision_filter_manager(root), self._robot, pairs)
 
     def _pose(self, X_BA: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None) -> QueryObject:
         """Poses the model and returns the geometry query for it."""

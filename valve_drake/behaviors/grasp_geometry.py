@@ -15,7 +15,7 @@ from valve_drake.checks import require
 from valve_drake.config import Config, number
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import LEFT, RIGHT, SIDES
-from valve_drake.robot.kinematics import RobotKinematics
+from valve_drake.robot.kinematics import RobotKinematics, seeds
 from valve_drake.valve.valve import Valve, heading, turned
 
 MAX_PLACES = 40  # distances of one search for a stance: it must end while the robot waits
@@ -86,6 +86,7 @@ class Arc:
     begun: bool = False
 
 
+OTHERS = 4  # postures that a redundant arm's way begins from, beside the first
 JUMP = 1.0  # a joint that moves so far between two angles of the turn is on another branch [rad]
 ONE_GRASP = 2.3  # a longer turn is not tried with one grasp alone [rad]
 CROSSED = 0.02  # the left hand is to the right of the right one by more than this [m]
@@ -168,7 +169,7 @@ class Stances:
         count = max(2, int(np.ceil(abs(turn_angle) / c.arc_step)) + 1)
         angles = np.linspace(0.0, turn_angle, count)
         limit = least if whole else c.margin_min
-        arms = {side: self._follow(X_BA, angles, side, grasps[side], near, limit, posture) for side in SIDES}
+        arms = {side: self._ways(X_BA, angles, side, grasps[side], near, limit, posture) for side in SIDES}
         begun = all(len(q) for q, _ in arms.values())
         reached = min(len(q) for q, _ in arms.values())
         out = Arc(-1.0, 0.0, grasps, begun=begun)
@@ -190,7 +191,7 @@ class Stances:
                 return dc.replace(out, margin=margin if arc.q else -1.0)
         return out
 
-    def _follow(
+    def _ways(
         self,
         X_BA: np.ndarray,
         angles: np.ndarray,
@@ -200,12 +201,37 @@ class Stances:
         least: float,
         posture: np.ndarray | None,
     ) -> tuple[list[np.ndarray], list[float]]:
+        """What `_follow` gives; a redundant arm that is not comfortable so begins from a few other postures too."""
+        arm = self.robot.arms[side]
+        best = self._follow(X_BA, angles, side, grasp, near.get(side) if near else None, least, posture)
+        if len(arm) <= 6 or not best[1]:
+            return best
+        for start in seeds(arm)[:OTHERS]:
+            if len(best[0]) == len(angles) and min(best[1]) >= self.config.margin_good:
+                break
+            way = self._follow(X_BA, angles, side, grasp, start, least, posture)
+            if way[1] and (len(way[0]), min(way[1])) > (len(best[0]), min(best[1])):
+                best = way
+        return best
+
+    def _follow(
+        self,
+        X_BA: np.ndarray,
+        angles: np.ndarray,
+        side: str,
+        grasp: Grasp,
+        near: np.ndarray | None,
+        least: float,
+        posture: np.ndarray | None,
+    ) -> tuple[list[np.ndarray], list[float]]:
         """One arm's joints and margins at the angles of a turn, up to where it can follow with a margin over `least`.
+
+        near: joints of a like arc's start.
 
         A margin that falls to `least` is the last of the second list, which is then the longer one.
         """
         robot, X_AG = self.robot, self.valve.grasp(grasp.handle, grasp.sign)
-        q_last = near.get(side) if near else None
+        q_last = near
         arc: list[np.ndarray] = []
         margins: list[float] = []
         for k, angle in enumerate(angles):

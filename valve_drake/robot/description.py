@@ -147,8 +147,9 @@ class FrameDescription(Config):
 
 @dc.dataclass
 class CollisionDescription(Config):
-    """Key `collision`. ignore: which pairs of shapes may touch beside those that the model file filters."""
+    """Key `collision`: which pairs of links are not looked at, beside those that the model file filters."""
 
+    srdf: str = plain("", "those of its disable_collisions: as model")
     ignore: str = choice("", ("", "touching_at_home"), "pairs that are ignored")
     padding: float = number(0.015, 0.0, 0.1, "least distance that counts as free [m]")
 
@@ -237,6 +238,9 @@ def parse(text: str, source: str, path: Path) -> RobotDescription:
     for name in ("head_calibration", "taught"):  # whoever reads one says that it is not there: a log has its own
         if value := getattr(robot, name):
             setattr(robot, name, _placed(value, path))
+    if robot.collision.srdf:
+        given_srdf, robot.collision.srdf = robot.collision.srdf, _placed(robot.collision.srdf, path)
+        find_file(robot.collision.srdf, f"{source}: collision.srdf", given_srdf)
     return robot
 
 

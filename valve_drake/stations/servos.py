@@ -1,10 +1,10 @@
 """What a robot's model file leaves to the simulation: servos of its joints, and which of its shapes may touch."""
 
-from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, SceneGraph
+from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
-from valve_drake.collision import CollisionModel
+from valve_drake.collision import CollisionModel, exclude
 from valve_drake.messages import SIDES
 from valve_drake.robot.robot import Robot
 
@@ -42,13 +42,8 @@ def add_servos(plant: MultibodyPlant, model: ModelInstanceIndex, robot: Robot) -
 
 
 def ignore_touching(plant: MultibodyPlant, scene_graph: SceneGraph, model: ModelInstanceIndex, robot: Robot) -> None:
-    """Links that touch while the robot is at home do not collide, where robot.yaml says so (`collision.ignore`).
+    """Links that may touch do not collide (robot.yaml's `collision`).
 
     For a plant that is finalized.
     """
-    if not robot.description.collision.ignore:
-        return
-    filters = scene_graph.collision_filter_manager()
-    for pair in CollisionModel(robot).ignored:
-        a, b = (GeometrySet(plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name, model))) for name in pair)
-        filters.Apply(CollisionFilterDeclaration().ExcludeBetween(a, b))
+    exclude(plant, scene_graph.collision_filter_manager(), model, CollisionModel(robot).ignored)
