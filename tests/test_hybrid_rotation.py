@@ -311,7 +311,7 @@ def test_a_held_turn_slows_down_to_rest_keeps_the_grasp_and_goes_on_where_it_sto
         forces.append(np.linalg.norm(bench.load[:, 3:], axis=1).max())
     assert np.min(np.diff(rates)) >= -CONFIG.rate / CONFIG.ramp * TICK - 1e-9 and rates[-1] == 0.0
     assert 0 <= bench.angle - begun < np.radians(2.5)
-    assert max(forces) < 30.0 and bench.gripper == [MARKER.handle_width] * 2
+    assert max(forces) < 30.0 and all(held is not None for held in bench.held) and max(bench.gripper) < 0.03
     for _ in range(int(30.0 / TICK)):
         status = bench.tick(modes[2])
         if status.state != "running":

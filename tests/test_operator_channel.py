@@ -170,7 +170,8 @@ def test_after_a_stop_or_a_success_a_new_move_needs_no_reset():
     bench.say("robot close")
     bench.say("confirm").run(0.2)
     assert bench.commands == ["open", "stop", "reset", "close"]
-    assert bench.mode == Mode.SEARCH and bench.supervisor.turn_angle == -QUARTER
+    assert bench.mode == Mode.FOLD and bench.supervisor.turn_angle == -QUARTER
+    assert bench.to(Mode.SEARCH).supervisor.entered == (Mode.FOLD, Mode.RETREAT, Mode.SEARCH)
     bench.to(Mode.DONE).run()
     bench.succeeds = set()
     bench.say("robot open")
@@ -260,6 +261,7 @@ def test_a_lost_link_in_a_run_leads_where_the_scenario_says(mode, on_loss):
         assert (bench.mode, bench.supervisor.held) == (mode, True)
     else:
         assert bench.commands == ["open", "stop"]
+        assert bench.shown.says.startswith("the link is lost") or bench.shown.done
         bench.run(0.2)
         assert bench.mode == Mode.STOPPED
         assert (Mode.RELEASE in bench.supervisor.entered) == TABLE[mode].contact
@@ -275,6 +277,20 @@ def test_a_desk_that_leaves_gives_the_ear_back_at_once_and_loses_its_link():
     bench.desks, bench.cut = [Desk(BOB)], False
     assert bench.run(0.2).shown.speaker == BOB
     assert bench.say("confirm").commands[-1] == "resume"
+
+
+def test_the_way_off_the_valve_leads_to_no_new_search_or_grasp_while_the_link_is_lost():
+    """Here: of a run that begins near the valve."""
+    bench = Bench().opening(Mode.MEASURE)
+    bench.say("stop").run()
+    bench.succeeds = set()
+    bench.say("robot close")
+    bench.say("confirm").run()
+    assert bench.to(Mode.RETREAT).supervisor.clearing
+    moved_on(bench)
+    assert bench.mode == Mode.RETREAT and bench.state.lost
+    bench.succeeds = set(RUNNING)
+    assert bench.run(0.5).mode == Mode.STOPPED and Mode.ROUGH_APPROACH not in bench.supervisor.entered
 
 
 def test_a_short_gap_is_no_loss():

@@ -524,6 +524,49 @@ def test_ages_are_judged_by_device():
     assert find_fault(CONFIG, 5.0, Health(time=5.0), SelectorReport(time=4.0)) == "no report from command_selector"
 
 
+# ---------------------------------------------------------------- another run after one that ended near the valve
+
+
+def again(bench: Bench, command: str = "close") -> Bench:
+    for word in ("reset", command):
+        bench.operator = OperatorCommand(sequence=bench.operator.sequence + 1, command=word)
+        bench.tick()
+    return bench
+
+
+@pytest.mark.parametrize("mode", RUNNING)
+def test_after_a_stop_near_the_valve_the_next_run_backs_off_before_it_looks(mode):
+    bench = bring_to(mode)
+    bench.operator = STOP
+    bench.until_end(succeed)
+    again(bench)
+    away = mode in (Mode.SEARCH, Mode.ROUGH_APPROACH)
+    assert bench.state.mode == (Mode.SEARCH if away else Mode.FOLD)
+    assert bench.until_end(succeed).verdict == Verdict.TURNED
+    first = [Mode.SEARCH] if away else [Mode.FOLD, Mode.RETREAT, Mode.SEARCH]
+    assert list(bench.state.entered[: len(first)]) == first
+    assert not bench.state.near
+
+
+def test_a_run_that_ended_with_its_own_retreat_leaves_nothing_to_clear():
+    bench = Bench()
+    bench.until_end(succeed)
+    assert again(bench).state.mode == Mode.SEARCH
+
+
+@pytest.mark.parametrize("mode", [Mode.FOLD, Mode.RETREAT])
+def test_a_robot_that_cannot_back_off_does_not_look_for_the_valve(mode):
+    bench = bring_to(Mode.MEASURE)
+    bench.operator = STOP
+    bench.until_end()
+    again(bench)
+    while bench.state.mode != mode:
+        bench.tick(succeed)
+    bench.until_end(fail_in(mode, Verdict.REACH_LIMIT))
+    assert (bench.state.mode, bench.state.verdict) == (Mode.FAILED, Verdict.REACH_LIMIT)
+    assert Mode.SEARCH not in bench.state.entered
+
+
 # ---------------------------------------------------------------- held by the operator
 
 

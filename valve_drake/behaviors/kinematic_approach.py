@@ -277,7 +277,7 @@ class KinematicApproach:
         if m.phase == "start":
             m = self._status(m, time, "running")
         if m.phase in ("start", "planning", "moving"):
-            m = self._homing(time, m, turned(m.plan.X_BA, inputs.turn.angle), inputs)
+            m = self._homing(time, m, self._valve(m, inputs.state, inputs.turn), inputs)
             if m.phase == "blocked":
                 return self._status(m, time, "failed", Verdict.REACH_LIMIT, "no collision-free path home")
         if m.phase == "home":

@@ -68,7 +68,8 @@ class State:
 
     speakers: tuple[Speaker, ...] = ()  # the last one heard at the end
     holder: int = 0  # who has the ear
-    lost: bool = False  # it was silent for too long
+    lost: bool = False  # it was silent for too long, or has left
+    why: str = ""  # which of both
     talk: Talk = Talk()
     packets: int = 0  # count of the last batch
     local: int = -1  # sequence of the last command of the program itself
@@ -161,7 +162,7 @@ def _hear(
     )
     s = changed(s, speakers=(*kept, known))
     if packet.leaves:
-        return changed(_lose(config, s, mode, "the operator has left"), holder=0) if packet.speaker == s.holder else s
+        return changed(_lose(s, "the operator has left"), holder=0) if packet.speaker == s.holder else s
     if in_time and (s.holder == 0 or s.lost):
         s = _take_ear(s, packet.speaker, mode)
     if not new:
@@ -193,23 +194,23 @@ def _take_ear(s: State, speaker: int, mode: ModeState) -> State:
 
 
 def _watch(config: OperatorChannelConfig, s: State, time: float, mode: ModeState) -> State:
-    """Notices that the link is lost, and does what the scenario says."""
-    if s.holder == 0 or s.lost:
+    """Notices that the link is lost; while it is, does what the scenario says."""
+    if s.holder != 0 and not s.lost:
+        last = next(one.last for one in s.speakers if one.number == s.holder)
+        if time - last > config.lease:
+            s = _lose(s, "the link is lost")
+    if not s.lost or config.on_loss == "finish":
         return s
-    last = next(one.last for one in s.speakers if one.number == s.holder)
-    return s if time - last <= config.lease else _lose(config, s, mode, "the link is lost")
-
-
-def _lose(config: OperatorChannelConfig, s: State, mode: ModeState, why: str) -> State:
-    if s.lost:
+    # The way off the valve goes on; what it leads to, another search or grasp, does not.
+    if mode.mode not in RUNNING or TABLE[Mode(mode.mode)].ending or mode.held:
         return s
-    s = changed(s, lost=True, talk=Talk(), follows=None)
-    moving = mode.mode in RUNNING and not TABLE[Mode(mode.mode)].ending
-    if not moving or config.on_loss == "finish":
-        return _answer(s, why + (": the run goes on" if moving else ""))
     if config.on_loss == "hold" and mode.mode in HOLDS:
-        return _answer(_give(s, "hold"), f"{why}: the grasp is held")
-    return _answer(_give(s, "stop"), f"{why}: stop")
+        return _answer(_give(s, "hold"), f"{s.why}: the grasp is held")
+    return _answer(_give(s, "stop"), f"{s.why}: stop")
+
+
+def _lose(s: State, why: str) -> State:
+    return _answer(changed(s, lost=True, why=why, talk=Talk(), follows=None), why)
 
 
 # ---------------------------------------------------------------- what was said

@@ -10,6 +10,9 @@ One block owns each mode: its Status, carrying this activation's number, ends it
     fault or operator's stop                    -> hands at the handles: release, then failed or stopped;
                                                    elsewhere at once, the robot held still
 
+A run that was stopped near the valve leaves the robot there. The next one begins with fold -> retreat -> search: from
+close by the marker may be out of the cameras' view, and the arms may be out.
+
 In grasp and turn the operator may `hold`: the turn stands still, the grasp is kept and no deadline runs, until `resume`
 or, after hold_time, a stop.
 
@@ -96,6 +99,8 @@ class State:
     retried: tuple[str, ...] = ()  # what failed and was tried again in this run
     held_at: float = math.inf  # since when the operator holds the turn; infinite: he does not [s]
     held_for: float = 0.0  # for how long he did so in this mode, before [s]
+    near: bool = False  # the robot has come up to the valve and has not backed off since; it outlives a reset
+    clearing: bool = False  # it backs off first, and only then looks for the valve: its arms may be out
 
     @property
     def held(self) -> bool:
@@ -200,6 +205,8 @@ def find_fault(config: SupervisorConfig, time: float, health: Health | None, sel
 
 def _enter(s: State, time: float, mode: Mode, reason: str, **changes: Any) -> State:
     """A new activation."""
+    if mode == Mode.FINE_APPROACH:
+        changes = {"near": True} | changes
     if s.held:
         began = s.began + time - s.held_at  # the run's own deadline did not run either
         changes = {"began": began, "held_at": time if mode in HOLDS else math.inf} | changes
@@ -225,7 +232,8 @@ def _held(s: State, time: float, request: str) -> State:
 
 
 def _reset(s: State, time: float) -> State:
-    return State(mode=Mode.IDLE, activation=s.activation + 1, since=time, reason="reset", sequence=s.sequence)
+    idle = State(mode=Mode.IDLE, activation=s.activation + 1, since=time, reason="reset")
+    return changed(idle, sequence=s.sequence, near=s.near)
 
 
 def _begin(config: SupervisorConfig, s: State, time: float, request: str, angle: float, fault: str) -> State:
@@ -236,7 +244,8 @@ def _begin(config: SupervisorConfig, s: State, time: float, request: str, angle:
     if fault:
         return _enter(s, time, Mode.FAILED, fault, verdict=Verdict.FAULT)
     sign = 1.0 if request == "open" else -1.0
-    return _enter(s, time, Mode.SEARCH, f"operator: {request}", turn_angle=sign * angle, began=time)
+    first = Mode.FOLD if s.near else Mode.SEARCH
+    return _enter(s, time, first, f"operator: {request}", turn_angle=sign * angle, began=time, clearing=s.near)
 
 
 def _aborting(s: State) -> bool:
@@ -258,11 +267,14 @@ def _succeed(s: State, time: float, status: Status) -> State:
         reason = s.reason  # the verdict's; what comes after it changes neither
     if s.mode == Mode.RELEASE:
         return _enter(s, time, s.after_release, reason)
+    if s.clearing:
+        back = s.mode == Mode.FOLD
+        return _enter(s, time, Mode.RETREAT if back else Mode.SEARCH, reason, clearing=back, near=back)
     if s.mode == Mode.FOLD:
         nothing_turned = Mode.TURN not in s.entered  # then there is nothing to verify
         return _enter(s, time, Mode.RETREAT if nothing_turned else Mode.VERIFY, reason)
     if s.mode == Mode.RETREAT:
-        return _enter(s, time, Mode.DONE if s.verdict == Verdict.TURNED else Mode.FAILED, s.reason)
+        return _enter(s, time, Mode.DONE if s.verdict == Verdict.TURNED else Mode.FAILED, s.reason, near=False)
     turned = {"verdict": Verdict.TURNED} if s.mode == Mode.VERIFY else {}
     after = TABLE[s.mode].next
     assert after is not None
@@ -285,4 +297,5 @@ def _give_up(s: State, time: float, verdict: Verdict, reason: str) -> State:
     if s.verdict not in (Verdict.NONE, Verdict.TURNED):
         verdict, reason = s.verdict, s.reason
     end = s.after_release if _aborting(s) else TABLE[s.mode].off
-    return _enter(s, time, end, reason, verdict=verdict, after_release=s.after_release if _aborting(s) else Mode.FOLD)
+    after = s.after_release if _aborting(s) else Mode.FOLD
+    return _enter(s, time, end, reason, verdict=verdict, after_release=after, clearing=False)
