@@ -299,6 +299,7 @@ def test_the_turn_is_counted_from_where_it_began():
 def test_a_held_turn_slows_down_to_rest_keeps_the_grasp_and_goes_on_where_it_stopped():
     bench = grasped()
     bench.activation += 1
+    bench.plan = dc.replace(bench.plan, turn=0.8)
     modes = [
         ModeState(mode="turn", activation=bench.activation, turn_angle=0.8, held=held) for held in (False, True, False)
     ]
