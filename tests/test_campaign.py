@@ -1,6 +1,9 @@
 """campaign: no run is lost or counted twice, a crash is a failure, and the numbers say what may be said."""
 
 import concurrent.futures
+import csv
+import html
+import io
 import json
 import os
 import signal
@@ -37,6 +40,8 @@ good = seed % 10 != 7
 numbers = {"outcome": "done" if good else "failed", "verdict": "turned" if good else "slip", "reason": "",
     "mode_durations_s": {"search": 1.0, "turn": 2.0, "done" if good else "failed": 0.1}, "sim_time_s": 60.0,
     "valve_angle_command_rad": 1.57, "valve_angle_true_rad": 1.56 if good else 0.5, "valve_angle_estimated_rad": 1.56,
+    "contact_honesty": {"left": 0.99, "right": 0.97}, "slips": {"left": 0, "right": 1}, "collisions": 1,
+    "peak_internal_force_N": 11.0, "estimator_nees": 0.8, "measured_position_rms_m": 0.002, "retries": 0,
     "turn_peak_hand_force_N": 20.0 + seed, "wall_time_s": time.time(), "processor_s": {"total": 30.0 + seed}}
 print(json.dumps(numbers))
 """
@@ -322,10 +327,74 @@ def test_compare_pairs_the_seeds_of_two_campaigns(tmp_path, fake):
 
 def test_the_report_holds_the_verdict_against_the_truth(tmp_path, fake):
     records = run(wanted(tmp_path / "out", 3, 6))
-    assert report._false_verdicts(records) == {"known": 3, "false_turned": 0, "false_failure": 0}
+
+    def counts():
+        found = campaign.false_verdicts(records)
+        return found["known"], found["false_turned"], found["false_failure"], [seed for _, seed, _ in found["seeds"]]
+
+    assert counts() == (3, 0, 0, [])
     records[0]["valve_angle_true_rad"] = 1.0  # it says turned, and is not
     records[1]["valve_angle_true_rad"] = 1.57  # it says slip, and is turned
-    assert report._false_verdicts(records) == {"known": 3, "false_turned": 1, "false_failure": 1}
+    assert counts() == (3, 1, 1, [6, 7])
+    found = campaign.summary(records)["verdicts_against_truth"]
+    assert found["false_turned_interval_95"] == pytest.approx([0.0084, 0.9057], abs=1e-3)
+    page = report.page(records, tmp_path)
+    assert "<b>1 + 1</b>" in page and "seed 6: false turned" in page and "seed 7: false failure" in page
+
+
+def test_records_and_page_have_contact_honesty_collisions_and_the_estimators_consistency(tmp_path, fake):
+    records = run(wanted(tmp_path / "out", 3, 8))
+    assert records[0]["contact_honesty"] == {"left": 0.99, "right": 0.97} and records[0]["estimator_nees"] == 0.8
+    numbers = campaign.summary(records)
+    assert (numbers["contact_honesty_least"], numbers["collisions"]) == (0.97, 3)
+    rows = list(csv.DictReader(io.StringIO(report.table(records))))
+    assert rows[0]["held by both pads, worse hand [%]"] == "97.0" and rows[0]["estimator's NEES at rest"] == "0.8"
+    page = report.page(records, tmp_path)
+    assert "97.0 %" in page and "3 collisions in all" in page
+
+
+def test_every_figure_and_the_success_stand_against_every_drawn_value(tmp_path, fake):
+    records = run(wanted(tmp_path / "out", 12, 1))
+    page = report.page(records, tmp_path)
+    for key in records[0]["draws"]:
+        assert f"<summary>{key}</summary>" in page
+        assert page.count(f"<title>{key}</title>") == 1  # the share that turned
+    known = [title for title, figure in report.FIGURES.items() if figure(records[0]) is not None]
+    assert len(known) > 8
+    for title in known:  # its distribution, and one plot for each drawn value
+        assert page.count(f"<title>{html.escape(title)}</title>") == 1 + len(records[0]["draws"])
+
+
+def test_a_page_of_300_runs_stays_small(tmp_path, fake):
+    records = run(wanted(tmp_path / "out", 2, 8))
+    many = [
+        records[0] | {"seed": k, "draws": {key: v * k for key, v in records[0]["draws"].items()}} for k in range(300)
+    ]
+    page = report.page(many, tmp_path)
+    assert len(page) < 2_500_000 and page.count("<") < 30_000  # elements: what a browser takes its time for
+
+
+# ---------------------------------------------------------------- the sequential test
+
+
+def test_without_its_package_compare_says_how_to_get_the_sequential_test(tmp_path, fake, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "sequentialized_barnard_tests", None)
+    for name in "ab":
+        run(wanted(tmp_path / name, 3))
+    assert cli.main(["campaign", "compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    assert "pip install 'valve-drake[step]'" in " ".join(capsys.readouterr().out.split())
+    assert comparison.compare(tmp_path / "a", tmp_path / "b")["step"] is None
+
+
+def test_the_sequential_test_tells_a_great_difference_early_and_none_never():
+    pytest.importorskip("sequentialized_barnard_tests")
+    good, bad = [True] * 60, [k % 2 == 0 for k in range(60)]
+    assert (found := statistics.sequential(bad, good)).verdict == "better" and found.pairs < 40
+    assert statistics.sequential(good, bad).verdict == "worse"
+    assert statistics.sequential(good, good) == statistics.Sequential("cannot tell yet", 60, None)
+    few = statistics.sequential(bad[:6], good[:6])
+    assert few.verdict == "cannot tell yet" and 0 < few.more < 60
+    assert statistics.sequential([], []).verdict == "cannot tell yet"
 
 
 def test_dask_gives_the_same_records(tmp_path, fake, monkeypatch):

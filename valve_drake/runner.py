@@ -22,7 +22,7 @@ from pydrake.systems.analysis import Simulator
 
 from valve_drake import config, named_files, outputs, profiling, yaml_file
 from valve_drake.analysis.comparison import Comparison
-from valve_drake.analysis.metrics import Summary, summarize
+from valve_drake.analysis.metrics import Summary, figures, summarize
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError, OperationFailed, require
@@ -116,23 +116,9 @@ class Result:
             "verdict": s.verdict,
             "reason": s.reason,
             "mode_durations_s": {mode: round(t, 4) for mode, t in s.mode_durations().items()},
-            "valve_angle_command_rad": s.command_rad,
-            "valve_angle_estimated_rad": s.angle_camera_rad,
-            "valve_angle_hands_rad": s.angle_hands_rad,
-            "valve_angle_true_rad": s.angle_true_rad,
-            "sim_time_s": s.sim_time_s,
+            **figures(s),
             "wall_time_s": self.wall_time,
             "real_time_factor": s.sim_time_s / max(self.wall_time, 1e-9),
-            "peak_hand_force_N": s.peak_hand_force_N,
-            "turn_peak_hand_force_N": s.turn_peak_hand_force_N,
-            "turn_mean_hand_force_N": s.turn_mean_hand_force_N,
-            "turn_mean_stem_force_N": s.turn_mean_stem_force_N,
-            "turn_share_left": s.turn_share_left,
-            "contact_honesty": s.contact_honesty,
-            "slips": s.slips,
-            "collisions": s.collisions,
-            "collided": [dc.asdict(found) for found in s.collided],
-            "peak_internal_force_N": s.peak_internal_force_N,
             "processor_s": self.spent.as_json(),
             "pace": self.pace and self.pace.as_json(),
             "log": str(self.log) if self.log else None,

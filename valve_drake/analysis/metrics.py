@@ -4,6 +4,7 @@ import dataclasses as dc
 import functools
 import itertools
 import os
+from typing import Any
 
 import numpy as np
 
@@ -110,6 +111,37 @@ class Summary:
         for span in self.spans:
             out[span.mode] = out.get(span.mode, 0.0) + span.duration
         return out
+
+
+def figures(s: Summary) -> dict[str, Any]:
+    """The numbers of a run for programs: what `run --json` and a campaign's records have of them.
+
+    estimator_nees: normalised estimation error squared, a degree of freedom, of the pose measured at rest, about the
+    errors' mean (see EstimateNumbers.spread); 1 is an honest covariance, below it is cautious.
+    """
+    rest = s.estimates.get(Mode.MEASURE)
+    spread = rest.spread if rest is not None else None
+    return {
+        "sim_time_s": s.sim_time_s,
+        "retries": s.retries,
+        "valve_angle_command_rad": s.command_rad,
+        "valve_angle_estimated_rad": s.angle_camera_rad,
+        "valve_angle_hands_rad": s.angle_hands_rad,
+        "valve_angle_true_rad": s.angle_true_rad,
+        "peak_hand_force_N": s.peak_hand_force_N,
+        "turn_peak_hand_force_N": s.turn_peak_hand_force_N,
+        "turn_mean_hand_force_N": s.turn_mean_hand_force_N,
+        "turn_mean_stem_force_N": s.turn_mean_stem_force_N,
+        "turn_share_left": s.turn_share_left,
+        "contact_honesty": s.contact_honesty,
+        "slips": s.slips,
+        "collisions": s.collisions,
+        "collided": [dc.asdict(found) for found in s.collided],
+        "peak_internal_force_N": s.peak_internal_force_N,
+        "estimator_nees": None if spread is None else spread**2,
+        "measured_position_rms_m": None if rest is None else rest.position_rms_m,
+        "measured_angle_rms_rad": None if rest is None else rest.angle_rms_rad,
+    }
 
 
 def summarize(log: str | os.PathLike[str] | LogReader | Traces) -> Summary:

@@ -13,6 +13,7 @@ import contextlib
 import dataclasses as dc
 import fcntl
 import json
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -243,10 +244,45 @@ def failures(records: Sequence[Record]) -> list[Record]:
     return [record for record in records if not turned(record)]
 
 
+def least_honesty(record: Record) -> float | None:
+    """The smaller share of both hands of the valve's way that their pads held; None: not known, or it did not move."""
+    shares = record.get("contact_honesty")
+    return min(shares.values()) if shares else None
+
+
+def false_verdicts(records: Sequence[Record], tolerance: float = math.radians(3.0)) -> dict[str, Any]:
+    """The verdict against the truth: `turned` though the valve is not where it should be, and the other way round, with
+    the interval of the rate of each.
+
+    tolerance: of the angle, the camera's tolerance and its error together.
+    """
+    known, false = 0, {"turned": 0, "failure": 0}
+    seeds: list[list[Any]] = []
+    for r in records:
+        asked, true = r.get("valve_angle_command_rad"), r.get("valve_angle_true_rad")
+        if asked is None or true is None:
+            continue
+        known += 1
+        there = abs(true - asked) <= tolerance
+        kind = "turned" if turned(r) and not there else "failure" if r["outcome"] == "failed" and there else ""
+        if kind:
+            false[kind] += 1
+            seeds.append([r["scenario"], r["seed"], f"false {kind}"])
+    return {
+        "known": known,
+        "false_turned": false["turned"],
+        "false_turned_interval_95": list(interval(false["turned"], known)),
+        "false_failure": false["failure"],
+        "false_failure_interval_95": list(interval(false["failure"], known)),
+        "seeds": seeds,
+    }
+
+
 def summary(records: Sequence[Record]) -> dict[str, Any]:
     """The object of `campaign --json`."""
     count = sum(map(turned, records))
     spent = [t["total"] for r in records if (t := r["times"].get("processor_s"))]
+    held = [share for r in records if turned(r) and (share := least_honesty(r)) is not None]
     return {
         "runs": len(records),
         "turned": count,
@@ -254,5 +290,8 @@ def summary(records: Sequence[Record]) -> dict[str, Any]:
         "failures": [
             {k: r[k] for k in ("scenario", "seed", "verdict", "mode", "outcome", "reason")} for r in failures(records)
         ],
+        "verdicts_against_truth": false_verdicts(records),
+        "contact_honesty_least": min(held) if held else None,
+        "collisions": sum(r.get("collisions") or 0 for r in records),
         "processor_s_per_run": sum(spent) / len(spent) if spent else None,
     }

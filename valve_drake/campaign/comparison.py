@@ -9,6 +9,10 @@ from valve_drake.campaign.trial import turned
 from valve_drake.checks import ConfigError
 
 FIGURES = {
+    "contact_honesty": campaign.least_honesty,
+    "peak_internal_force_N": lambda r: r.get("peak_internal_force_N"),
+    "measured_position_rms_m": lambda r: r.get("measured_position_rms_m"),
+    "estimator_nees": lambda r: r.get("estimator_nees"),
     "turn_peak_hand_force_N": lambda r: r.get("turn_peak_hand_force_N"),
     "turn_mean_stem_force_N": lambda r: r.get("turn_mean_stem_force_N"),
     "sim_time_s": lambda r: r.get("sim_time_s"),
@@ -26,7 +30,8 @@ def compare(a: Path, b: Path) -> dict[str, Any]:
     if not keys:
         raise ConfigError(f"compare: {a} and {b} have no seed in common")
     pairs = [(one[key], other[key]) for key in keys]
-    found = statistics.compare([turned(r) for r, _ in pairs], [turned(r) for _, r in pairs])
+    successes = [turned(r) for r, _ in pairs], [turned(r) for _, r in pairs]
+    found, step = statistics.compare(*successes), statistics.sequential(*successes)
     differences = {}
     for name, figure in FIGURES.items():
         both = [(figure(r), figure(s)) for r, s in pairs if turned(r) and turned(s)]
@@ -39,5 +44,6 @@ def compare(a: Path, b: Path) -> dict[str, Any]:
         "turned_a": sum(turned(r) for r, _ in pairs),
         "turned_b": sum(turned(r) for _, r in pairs),
         **dc.asdict(found),
+        "step": None if step is None else dc.asdict(step),
         "differences": differences,
     }

@@ -5,6 +5,7 @@ import io
 import math
 import shlex
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 
-from valve_drake.analysis.metrics import summarize
+from valve_drake.analysis.metrics import figures, summarize
 from valve_drake.analysis.plots import nice_ticks
-from valve_drake.campaign.campaign import summary
+from valve_drake.campaign.campaign import least_honesty, summary
 from valve_drake.campaign.trial import Record, turned
 from valve_drake.checks import ConfigError
 from valve_drake.recording.reader import LogReader
@@ -24,14 +25,29 @@ GOOD, BAD = "#2f8f5b", "#c0392b"
 _WIDE, _HIGH, _LEFT, _BOTTOM = 340, 150, 46, 30  # of a small plot [px]
 
 # Figures of a run, as the page shows them: title, value of a record (None: not known).
-FIGURES: dict[str, Any] = {
+FIGURES: dict[str, Callable[[Record], float | None]] = {
     "camera minus truth [deg]": lambda r: _degrees(r, "valve_angle_estimated_rad", "valve_angle_true_rad"),
     "true angle minus command [deg]": lambda r: _degrees(r, "valve_angle_true_rad", "valve_angle_command_rad"),
+    "held by both pads, worse hand [%]": lambda r: _percent(least_honesty(r)),
+    "slips": lambda r: None if r.get("slips") is None else sum(r["slips"].values()),
+    "collisions": lambda r: r.get("collisions"),
+    "peak internal force [N]": lambda r: r.get("peak_internal_force_N"),
     "peak hand force while turning [N]": lambda r: r.get("turn_peak_hand_force_N"),
     "stem force beyond the couple [N]": lambda r: r.get("turn_mean_stem_force_N"),
+    "position error measured at rest [mm]": lambda r: _times(r.get("measured_position_rms_m"), 1e3),
+    "estimator's NEES at rest": lambda r: r.get("estimator_nees"),
+    "retries": lambda r: r.get("retries"),
     "simulated time [s]": lambda r: r.get("sim_time_s"),
     "processor time [s]": lambda r: (r["times"].get("processor_s") or {}).get("total"),
 }
+
+
+def _times(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value
+
+
+def _percent(share: float | None) -> float | None:
+    return _times(share, 100.0)
 
 
 def _degrees(record: Record, a: str, b: str) -> float | None:
@@ -69,9 +85,9 @@ def page(records: list[Record], beside: Path, logs: Path | None = None) -> str:
             path = (logs or beside) / log
             review = path.with_name(f"{path.stem}.review.html")
             link = _relative(review if review.exists() else path, beside)
-        figures = {title: figure(record) for title, figure in FIGURES.items()}
+        values = {title: figure(record) for title, figure in FIGURES.items()}
         again = shlex.join(record["command"]) if record.get("command") else ""
-        rows.append({"r": record, "good": turned(record), "figures": figures, "link": link, "again": again})
+        rows.append({"r": record, "good": turned(record), "figures": values, "link": link, "again": again})
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("valve_drake.campaign", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
@@ -79,12 +95,11 @@ def page(records: list[Record], beside: Path, logs: Path | None = None) -> str:
         made=Markup(MADE),
         numbers=numbers,
         verdicts=Counter((r["verdict"] or r["outcome"], "" if turned(r) else r["mode"]) for r in records).most_common(),
-        wrong=_false_verdicts(records),
         rows=rows,
         draws=draws,
         figures=list(FIGURES),
         histograms=[_histogram(title, [row["figures"][title] for row in rows]) for title in FIGURES],
-        scatters=[(key, [_scatter(key, title, rows) for title in list(FIGURES)[:4]]) for key in draws],
+        scatters=[(key, [_scatter(key, title, rows) for title in FIGURES]) for key in draws],
         shares=[_shares(key, rows) for key in draws],
     )
 
@@ -94,23 +109,6 @@ def _relative(path: Path, beside: Path) -> str:
         return path.resolve().relative_to(beside.resolve()).as_posix()
     except ValueError:
         return path.resolve().as_uri()
-
-
-def _false_verdicts(records: list[Record], tolerance: float = math.radians(3.0)) -> dict[str, int]:
-    """The verdict against the truth: `turned` though the valve is not where it should be, and the other way round.
-
-    tolerance: of the angle, the camera's tolerance and its error together.
-    """
-    out = {"known": 0, "false_turned": 0, "false_failure": 0}
-    for r in records:
-        asked, true = r.get("valve_angle_command_rad"), r.get("valve_angle_true_rad")
-        if asked is None or true is None:
-            continue
-        out["known"] += 1
-        there = abs(true - asked) <= tolerance
-        out["false_turned"] += turned(r) and not there
-        out["false_failure"] += not turned(r) and there and r["outcome"] == "failed"
-    return out
 
 
 # ---------------------------------------------------------------- small plots
@@ -162,12 +160,14 @@ def _scatter(key: str, title: str, rows: list[dict[str, Any]]) -> tuple[str, Mar
     if not known:
         return title, None
     xs, ys = _range([p[0] for p in known]), _range([p[1] for p in known])
-    dots = []
+    ways = {True: "", False: ""}  # one element for all runs of a kind: pages of hundreds of runs stay quick
     for x, y, good in known:
         px = _LEFT + (x - xs[0]) / (xs[1] - xs[0]) * (_WIDE - 6 - _LEFT)
         py = _HIGH - _BOTTOM - (y - ys[0]) / (ys[1] - ys[0]) * (_HIGH - _BOTTOM - 6)
-        dots.append(f'<circle cx="{px:.1f}" cy="{py:.1f}" r="2" fill="{GOOD if good else BAD}"/>')
-    return title, _frame(title, xs, ys, "".join(dots), key)
+        ways[good] += f"M{px:.0f} {py:.0f}h0"
+    colors = {True: GOOD, False: BAD}
+    body = "".join(f'<path class="d" stroke="{colors[good]}" d="{way}"/>' for good, way in ways.items() if way)
+    return title, _frame(title, xs, ys, body, key)
 
 
 def _shares(key: str, rows: list[dict[str, Any]], bins: int = 6) -> tuple[str, Markup]:
@@ -213,14 +213,5 @@ def _record_of(path: Path, folder: Path) -> Record:
         "verdict": s.verdict,
         "reason": s.reason,
         "mode": modes[-1] if modes else "",
-        "sim_time_s": s.sim_time_s,
-        "valve_angle_command_rad": s.command_rad,
-        "valve_angle_estimated_rad": s.angle_camera_rad,
-        "valve_angle_hands_rad": s.angle_hands_rad,
-        "valve_angle_true_rad": s.angle_true_rad,
-        "peak_hand_force_N": s.peak_hand_force_N,
-        "turn_peak_hand_force_N": s.turn_peak_hand_force_N,
-        "turn_mean_hand_force_N": s.turn_mean_hand_force_N,
-        "turn_mean_stem_force_N": s.turn_mean_stem_force_N,
-        "turn_share_left": s.turn_share_left,
+        **figures(s),
     }

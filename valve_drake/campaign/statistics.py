@@ -52,6 +52,43 @@ def mcnemar(better: int, worse: int) -> float:
     return float(stats.binomtest(better, better + worse, 0.5).pvalue) if better + worse else 1.0
 
 
+STEP_MOST = 500  # pairs that the sequential test is made for; fixed before any run, as the test demands
+
+
+@dc.dataclass(frozen=True)
+class Sequential:
+    """What a test says that may be asked after every run.
+
+    verdict: of B against A, as in Paired. pairs: how many it took to tell, or that there were. more: about so many
+    further pairs would tell if they went on as now, up to STEP_MOST; None where that would not do.
+    """
+
+    verdict: str
+    pairs: int
+    more: int | None
+
+
+def sequential(a: Sequence[bool], b: Sequence[bool], level: float = 1 - CONFIDENCE) -> Sequential | None:
+    """STEP (Snyder et al., 2025) on the runs in their order, at `level` for each direction; None: it is not installed.
+
+    It compares two rates and makes no use of the pairs having a seed in common.
+    """
+    try:
+        from sequentialized_barnard_tests import Hypothesis, MirroredStepTest
+    except ImportError:
+        return None
+    test = MirroredStepTest(Hypothesis.P0LessThanP1, n_max=STEP_MOST, alpha=level, random_seed=1)
+    pairs = list(zip(a, b, strict=True))
+    words = {"AcceptAlternative": "better", "AcceptNull": "worse"}
+    for k in range(STEP_MOST if pairs else 0):  # what there is, and then the same over again
+        decision = test.step(*map(int, pairs[k % len(pairs)])).decision.name
+        if decision in words and k < len(pairs):
+            return Sequential(words[decision], k + 1, None)
+        if decision in words:
+            return Sequential("cannot tell yet", len(pairs), k + 1 - len(pairs))
+    return Sequential("cannot tell yet", len(pairs), None)
+
+
 def _more(better: int, worse: int, trials: int, level: float) -> int | None:
     """How many more trials until the test tells, at the present rates of both kinds of difference."""
     if better == worse:

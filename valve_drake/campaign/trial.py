@@ -15,6 +15,8 @@ import time
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from valve_drake.analysis.metrics import Summary, figures
+
 Record: TypeAlias = dict[str, Any]
 
 PROGRAM = (sys.executable, "-m", "valve_drake")
@@ -24,11 +26,7 @@ _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 _LIBC = ctypes.CDLL(None)
 _running: "set[subprocess.Popen[bytes]]" = set()  # in this process
 # Taken over from `run --json` as they are; those of `_TIMES` depend on the machine.
-_FIGURES = (
-    "sim_time_s", "valve_angle_command_rad", "valve_angle_estimated_rad", "valve_angle_hands_rad",
-    "valve_angle_true_rad", "peak_hand_force_N", "turn_peak_hand_force_N", "turn_mean_hand_force_N",
-    "turn_mean_stem_force_N", "turn_share_left",
-)  # fmt: skip
+_FIGURES = tuple(figures(Summary()))
 _TIMES = ("wall_time_s", "real_time_factor", "processor_s")
 
 

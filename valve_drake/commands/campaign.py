@@ -125,6 +125,15 @@ def compare(options: argparse.Namespace) -> int:
     say(f"only B turned {found['better']}, only A {found['worse']}; McNemar's exact p = {found['p']:.3g}")
     more = "" if found["more"] is None else f": some {found['more']} more runs would tell at the present rates"
     say(f"B is {found['verdict']}{more}" if found["verdict"] != "cannot tell yet" else f"cannot tell yet{more}")
+    step = found["step"]
+    if step is None:
+        say("the sequential test STEP is not installed: pip install 'valve-drake[step]'")
+    else:
+        told = f"B is {step['verdict']}, told by {step['pairs']} runs"
+        if step["verdict"] == "cannot tell yet":
+            told = "cannot tell yet"
+            told += "" if step["more"] is None else f": some {step['more']} more runs would tell at the present rates"
+        say(f"STEP, which may be asked after every run: {told}")
     for name, row in found["differences"].items():
         say(f"  {name}: B minus A {row['mean']:+.4g}, 95 % interval {row['low']:+.4g} to {row['high']:+.4g}")
     return OK
