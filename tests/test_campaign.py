@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import csv
-import html
 import io
 import json
 import os
@@ -14,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from markupsafe import escape
 
 from valve_drake import cli
 from valve_drake.campaign import campaign, comparison, executors, report, statistics, trial
@@ -362,7 +362,7 @@ def test_every_figure_and_the_success_stand_against_every_drawn_value(tmp_path, 
     known = [title for title, figure in report.FIGURES.items() if figure(records[0]) is not None]
     assert len(known) > 8
     for title in known:  # its distribution, and one plot for each drawn value
-        assert page.count(f"<title>{html.escape(title)}</title>") == 1 + len(records[0]["draws"])
+        assert page.count(f"<title>{escape(title)}</title>") == 1 + len(records[0]["draws"])
 
 
 def test_a_page_of_300_runs_stays_small(tmp_path, fake):

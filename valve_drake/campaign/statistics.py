@@ -53,6 +53,7 @@ def mcnemar(better: int, worse: int) -> float:
 
 
 STEP_MOST = 500  # pairs that the sequential test is made for; fixed before any run, as the test demands
+STEP_LEVEL = 0.05
 
 
 @dc.dataclass(frozen=True)
@@ -68,8 +69,8 @@ class Sequential:
     more: int | None
 
 
-def sequential(a: Sequence[bool], b: Sequence[bool], level: float = 1 - CONFIDENCE) -> Sequential | None:
-    """STEP (Snyder et al., 2025) on the runs in their order, at `level` for each direction; None: it is not installed.
+def sequential(a: Sequence[bool], b: Sequence[bool]) -> Sequential | None:
+    """STEP (Snyder et al., 2025) on the runs in their order, at 5 % for each direction; None: it is not installed.
 
     It compares two rates and makes no use of the pairs having a seed in common.
     """
@@ -77,7 +78,8 @@ def sequential(a: Sequence[bool], b: Sequence[bool], level: float = 1 - CONFIDEN
         from sequentialized_barnard_tests import Hypothesis, MirroredStepTest
     except ImportError:
         return None
-    test = MirroredStepTest(Hypothesis.P0LessThanP1, n_max=STEP_MOST, alpha=level, random_seed=1)
+    # The package brings the decision table of this n_max and alpha; it would compute any other first.
+    test = MirroredStepTest(Hypothesis.P0LessThanP1, n_max=STEP_MOST, alpha=STEP_LEVEL, random_seed=1)
     pairs = list(zip(a, b, strict=True))
     words = {"AcceptAlternative": "better", "AcceptNull": "worse"}
     for k in range(STEP_MOST if pairs else 0):  # what there is, and then the same over again
