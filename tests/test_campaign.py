@@ -283,6 +283,7 @@ def test_two_campaigns_do_not_share_a_folder(tmp_path, fake):
         (["--first-seed", "-1"], "--first-seed must be 0 or more"),
         (["--jobs", "0"], "--jobs must be within 1 and 1024, got 0"),
         (["--scheduler", "tcp://x"], "--scheduler goes with --backend dask"),
+        (["--set", "operator_channel.wire=lcm"], "operator_channel.wire must be none in a campaign"),
         (["simulated.scenario.yaml", "simulated"], "two scenarios are called simulated"),
         (["nothing.yaml"], "nothing.yaml"),
         (["--time-out", "0"], "--time-out must be above 0"),

@@ -60,6 +60,24 @@ def test_every_output_but_telemetry_has_a_reader(system):
     assert {name for name in unread if not name.startswith("station.truth.")} == {"image_servo.servo"}
 
 
+@pytest.fixture(scope="module")
+def listening():
+    """The diagram of a run that listens to operators."""
+    return mut.make_diagram(scenarios.resolve(scenarios.load(None, ["operator_channel.wire=lcm"])))
+
+
+def test_operators_stand_before_the_supervisors_port_and_change_no_other_arrow(system, listening):
+    before, after = set(mut.wiring(system.diagram)), set(mut.wiring(listening.diagram))
+    assert before < after
+    assert all("operator_channel." in line for line in after - before)
+    assert "operator_channel.command -> supervisor.operator" in after
+    names = {listening.diagram.get_input_port(k).get_name() for k in range(listening.diagram.num_input_ports())}
+    assert names == {mut.OPERATOR, mut.PACKETS}
+    assert system.operator_channel is None and listening.operator_channel is not None
+    test_one_name_for_block_module_class_and_scenario_key(listening)
+    assert ">operator_channel<" in drawing.svg(listening.diagram)
+
+
 def test_one_name_for_block_module_class_and_scenario_key(system):
     keys = set(vars(scenarios.Scenario()))
     for block in system.diagram.GetSystems():

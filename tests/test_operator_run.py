@@ -10,7 +10,7 @@ from operator_session import Session, ended, said
 from valve_drake import cli
 from valve_drake.analysis.conversation import exchanges
 from valve_drake.operator.grammar import Heard
-from valve_drake.operator.wire import RATE, Sound
+from valve_drake.operator.wire import RATE
 from valve_drake.recording import foxglove
 from valve_drake.recording.reader import LogReader
 
@@ -36,7 +36,7 @@ def short(tmp_path_factory):
     session = Session(*QUICK, limit=8.0)
 
     def hum(session):
-        session.desk.sound(Sound(session.now, 0, RATE, np.full(1280, 99, np.int16)))
+        session.desk.sound(np.full(1280, 99, np.int16))
         session.desk.say(Heard("robot, open the valve", 0.9))
 
     session.run(

@@ -15,7 +15,9 @@ from valve_drake.operator.grammar import LONGEST, Heard
 from valve_drake.operator.operator_link import MOST, OperatorLink
 from valve_drake.operator.wire import (
     RATE,
+    News,
     Sound,
+    Tail,
     read_report,
     read_sound,
     read_words,
@@ -205,10 +207,32 @@ def test_a_second_program_is_refused_and_a_desk_does_not_listen_to_it():
 def test_sound_reaches_the_program_and_no_more_is_kept_than_has_room():
     pair = Pair().run()
     for k in range(MOST + 5):
-        pair.desk.sound(Sound(float(k), k, RATE, np.full(80, k, np.int16)))
+        pair.desk.sound(np.full(80, k, np.int16))
         pair.program.take(pair.time)
-    assert [int(sound.samples[0]) for sound in pair.program.sounds()] == list(range(MOST))
+    assert [sound.samples.tolist() for sound in pair.program.sounds()] == [[k] * 80 for k in range(MOST)]
     assert pair.program.sounds() == []
+
+
+def test_pieces_that_are_lost_are_made_good_by_those_that_follow_and_none_comes_twice():
+    whole = (np.arange(40 * 1280) % 30000).astype(np.int16)
+    tail, news = Tail(), News()
+    sent = [tail.add(piece, 5.0 + k * 0.08) for k, piece in enumerate(whole.reshape(40, 1280))]
+    got = []
+    for sound in sent[3::4]:  # a program that looks every 0.32 s: the bus keeps one message
+        got += [news.take(read_sound(sound_message(sound))) for _ in range(2)]
+    assert [sound is None for sound in got] == [False, True] * 10
+    assert np.array_equal(np.concatenate([sound.samples for sound in got[::2]]), whole)
+    assert [sound.sequence for sound in got[::2]] == [5120 * k for k in range(10)]
+    assert [sound.time for sound in got[::2]] == pytest.approx([5.0 + 0.32 * k for k in range(10)])
+
+
+def test_another_desks_sound_begins_anew():
+    pair = Pair(desks=2).run()
+    for desk in pair.desks:
+        for _ in range(20):
+            desk.sound(np.ones(1280, np.int16))
+            pair.program.take(pair.time)
+    assert sum(len(sound.samples) for sound in pair.program.sounds()) == 2 * 20 * 1280
 
 
 # ---------------------------------------------------------------- signatures, bad messages

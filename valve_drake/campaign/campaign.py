@@ -57,6 +57,8 @@ class Campaign:
         trials = []
         for name, path in zip(names, self.scenarios):
             given = scenario.load(path, self.overrides)
+            wire = given.operator_channel.wire
+            require(wire == "none", "operator_channel.wire", "none in a campaign: its runs wait for nobody", wire)
             for seed in range(self.first_seed, self.first_seed + self.runs):
                 log = (self.out / LOGS / f"{name}-{seed}.mcap").resolve()
                 draws = drawn(dc.replace(given, seed=seed))

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 FRAME = 0.1  # between two pictures [s]
 POLL = 0.01  # between two looks at the wire [s]
 ANSWER = 5.0  # for the robot's answer to one sentence [s]
+GONE = 10.0  # a script gives a program up that was silent for longer [s]
 
 
 def add(commands: Subcommands) -> None:
@@ -69,8 +70,8 @@ def command(options: argparse.Namespace) -> int:
         return _send(link, sound)
     desk = Desk(link, recogniser, send_sound=options.voice != "wire")
     alone = link.claim()
-    while not alone():
-        desk.poll()
+    while not alone():  # it listens and says nothing
+        link.bus.pump()
         time.sleep(POLL)
     if options.voice == "wire":
         link.listen(desk.sound)
@@ -156,12 +157,12 @@ def _keys() -> Iterator[Callable[[float], str]]:
 def _send(link: "DeskLink", sound: "np.ndarray") -> int:
     """Puts sound on the bus at its own speed."""
     from valve_drake.operator.ear import PIECE, pieces
-    from valve_drake.operator.wire import RATE, Sound
+    from valve_drake.operator.wire import RATE
 
     begin = time.monotonic()
     for k, piece in enumerate(pieces(sound)):
         time.sleep(max(begin + (k + 1) * PIECE - time.monotonic(), 0.0))
-        link.sound(Sound(time.monotonic() - PIECE, k * len(piece), RATE, piece))
+        link.sound(piece)
     say(f"{len(sound) / RATE:.1f} s of sound were sent")
     return OK
 
@@ -201,7 +202,8 @@ def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace,
     link = desk.link
     with signals(handle):
         if not until(lambda: link.commanding, ANSWER):
-            who = "another operator commands" if link.linked else "no program listens (valve-drake run --operator)"
+            silent = "no program listens (valve-drake run --operator)" + link.bus.excuse()
+            who = "another operator commands" if link.linked else silent
             raise OperationFailed(f"the robot does not listen to this desk: {who}")
         for text in options.say:
             desk.say(Heard(text, typed=True))
@@ -217,7 +219,7 @@ def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace,
         until(lambda: False, 0.3)  # what the robot says last
         begun = link.commanding and link.state.task > 0
         if begun:
-            until(lambda: link.state.done or not link.commanding, float("inf"))
+            until(lambda: link.state.done or link.silence > GONE or link.state.speaker != link.number, float("inf"))
             until(lambda: False, 4 * POLL)
     state = link.state
     refused = [outcome for outcome in outcomes if outcome in ("refused", "ignored")]

@@ -12,7 +12,7 @@ from valve_drake.operator.desk_link import DeskLink
 from valve_drake.operator.ear import Recogniser
 from valve_drake.operator.grammar import SURE, Heard, Kind, parse
 from valve_drake.operator.operator_channel import tag
-from valve_drake.operator.wire import RATE, Sound
+from valve_drake.operator.wire import RATE
 from valve_drake.task.modes import RUNNING, TABLE
 
 if TYPE_CHECKING:
@@ -64,7 +64,6 @@ class Desk:
         self._begun = clock()
         self._answers = self._program = 0
         self._asked_to_leave = False
-        self._sounds = 0
         self._begin: float | None = None  # of the first sample [s]
         self._level = 0.0
 
@@ -83,8 +82,7 @@ class Desk:
             self._begin = begin
         self._level = float(np.sqrt(np.mean((samples / 2**15) ** 2))) if len(samples) else 0.0
         if self._send_sound:
-            self.link.sound(Sound(max(begin, 0.0), self._sounds, RATE, samples))
-            self._sounds += len(samples)
+            self.link.sound(samples)
         for heard in self._ear.push(samples) if self._ear else ():
             self.say(dc.replace(heard, begin=self._begin + heard.begin, end=self._begin + heard.end))
 

@@ -14,12 +14,12 @@ import numpy as np
 from valve_drake.messages import OperatorPacket, OperatorState
 from valve_drake.operator.grammar import SURE, Heard, Kind, parse
 from valve_drake.operator.operator_channel import tag
-from valve_drake.operator.wire import Sound, read_report, read_sound, sound_message, words_message
+from valve_drake.operator.wire import RATE, News, Tail, read_report, read_sound, sound_message, words_message
 from valve_drake.stations.bus import ANNOUNCED, BadMessage, Bus
 from valve_drake.stations.lcm_channels import AUDIO, CONTROLLER, OPERATOR, WORDS, WrongMessage
 from valve_drake.stations.reports import PRESENT
 
-SILENT = 1.0  # a program that was not heard for longer is gone [s]
+SILENT = 3.0  # a program that was not heard for longer is gone; raise it for one that often waits for a processor [s]
 MOST = 64  # messages that are taken in at once
 PATIENCE = 3.0  # words that were not taken within this time are given up [s]
 
@@ -40,6 +40,7 @@ class DeskLink:
         self._sequence = 0
         self._sent_at = float("-inf")
         self._refused = False
+        self._tail = Tail()
         self._told_others = False
         bus.listen(CONTROLLER, self._hear, between=OPERATOR)
 
@@ -51,7 +52,12 @@ class DeskLink:
     @property
     def linked(self) -> bool:
         """The program is heard."""
-        return self.clock() - self._heard_at <= SILENT
+        return self.silence <= SILENT
+
+    @property
+    def silence(self) -> float:
+        """Since the program was heard last [s]."""
+        return self.clock() - self._heard_at
 
     @property
     def commanding(self) -> bool:
@@ -79,21 +85,26 @@ class DeskLink:
     def listen(self, take: Callable[[np.ndarray], None]) -> None:
         """Hands the sound that others put on the bus to `take` (n,) int16, as `poll` finds it."""
 
+        news = News()
+
         def hear(key: str, message: Any) -> None:
             if key != AUDIO:
                 return
             try:
                 if isinstance(message, BadMessage):
                     raise WrongMessage(message.words)
-                take(read_sound(message).samples)
+                sound = news.take(read_sound(message))
             except WrongMessage:
                 self.dropped += 1
+                return
+            if sound is not None:
+                take(sound.samples)
 
         self.bus.listen(OPERATOR, hear, between=OPERATOR)
 
-    def sound(self, sound: Sound) -> None:
-        """Sound for the robot's log."""
-        self.bus.send(AUDIO, sound_message(sound))
+    def sound(self, samples: np.ndarray) -> None:
+        """Sound (n,) int16 at RATE that was heard just now, for the robot's log and who else listens."""
+        self.bus.send(AUDIO, sound_message(self._tail.add(samples, self.clock() - len(samples) / RATE)))
 
     def poll(self) -> None:
         """Takes in what has arrived, and says what is due."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from valve_drake.messages import OperatorPacket, OperatorPackets, OperatorState
-from valve_drake.operator.wire import Sound, read_sound, read_words, report_message
+from valve_drake.operator.wire import News, Sound, read_sound, read_words, report_message
 from valve_drake.stations.bus import ANNOUNCED, BadMessage, Bus
 from valve_drake.stations.lcm_channels import CHANNELS, CONTROLLER, OPERATOR, REPORT, WORDS, WrongMessage
 
@@ -24,6 +24,7 @@ class OperatorLink:
         self._alone = alone
         self._packets: list[OperatorPacket] = []
         self._sounds: list[Sound] = []
+        self._news = News()
         self._count = 0
         self._told: OperatorState | None = None
         self._told_at = float("-inf")
@@ -38,8 +39,8 @@ class OperatorLink:
                 if to == self.bus.instance and len(self._packets) < MOST:  # else it is another program's, or of old
                     self._packets.append(packet)
             else:
-                sound = read_sound(message)
-                if len(self._sounds) < MOST:
+                sound = self._news.take(read_sound(message))
+                if sound is not None and len(self._sounds) < MOST:
                     self._sounds.append(sound)
         except WrongMessage:
             device = CHANNELS[key].key

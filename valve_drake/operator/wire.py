@@ -14,6 +14,7 @@ from valve_drake.stations.lcm_channels import LONGEST_NAME, WrongMessage, from_u
 
 RATE = 16000  # of the sound [Hz]
 MOST_SAMPLES = 16000  # in one message
+AGAIN = 0.4  # of sound that every message repeats: a bus keeps one message a channel until somebody asks for it [s]
 LARGEST = 2.0**53  # whole numbers up to here are exact
 _WORDS = "words"
 _TEXTS = tuple(f.name for f in dc.fields(OperatorState) if f.type is str)
@@ -28,6 +29,39 @@ class Sound:
     sequence: int
     rate: int  # [Hz]
     samples: np.ndarray  # (n,) int16
+
+
+class Tail:
+    """A sender's sound with its last AGAIN seconds."""
+
+    def __init__(self) -> None:
+        self._samples = np.zeros(0, np.int16)
+        self._count = 0  # samples so far
+
+    def add(self, samples: np.ndarray, time: float) -> Sound:
+        """What is to be sent when these (n,) have been heard; time: of the first of them [s]."""
+        self._count += len(samples)
+        joined = np.concatenate([self._samples, samples])
+        before = len(joined) - len(samples)
+        self._samples = joined[-round(AGAIN * RATE) :]
+        return Sound(max(time - before / RATE, 0.0), self._count - len(joined), RATE, joined)
+
+
+class News:
+    """What of each message's sound was not there before."""
+
+    def __init__(self) -> None:
+        self._next = 0  # the sample that follows the last one
+
+    def take(self, sound: Sound) -> Sound | None:
+        """The new part; None: there is none. A count that begins anew is another sender's."""
+        if sound.sequence == 0 and self._next > MOST_SAMPLES:
+            self._next = 0
+        old = max(self._next - sound.sequence, 0)
+        if old >= len(sound.samples):
+            return None
+        self._next = sound.sequence + len(sound.samples)
+        return Sound(sound.time + old / RATE, sound.sequence + old, sound.rate, sound.samples[old:])
 
 
 def _named(values: Mapping[str, float], texts: Mapping[str, str]) -> lcmt_drake_signal:
