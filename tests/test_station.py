@@ -132,7 +132,7 @@ def test_joints_bear_their_weight_without_a_sag(rig):
     port = physics.plant.get_net_actuation_output_port(physics.robot)
     np.testing.assert_allclose(
         port.Eval(context),
-        physics.GetOutputPort("actuation").Eval(physics.GetMyContextFromRoot(rig.context)),
+        physics.GetOutputPort("now").Eval(physics.GetMyContextFromRoot(rig.context))[physics.parts["actuation"]],
         atol=1e-3,
     )
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import gc
 import io
 import logging
 import os
@@ -50,10 +51,16 @@ COMMANDS = (
 )  # as --help lists them
 
 
+GARBAGE = (
+    20_000  # new objects that could be in circles before they are looked through: 700, as Python has it, finds none
+)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command -> exit code."""
-    # Of BLAS, that no matrix here is large enough for: a process with one thread can be forked (camera_workers.py).
+    # Of BLAS, that no matrix here is large enough for: a process with one thread can be forked (beside.py).
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.set_threshold(GARBAGE)
     logging.getLogger("drake").addFilter(_is_warning)  # its news would stand between the program's lines
     logging.getLogger("valve_drake").addHandler(logging.NullHandler())  # the commands say it themselves
     with _terminal() as output:

@@ -3,8 +3,11 @@
 A block is a pure step at fixed times (ports.py), so that nothing is left of a simulation when its inputs are a
 recording: no plant, no integrator, no copies of a Context. Blocks, wires and the recorder are those of diagram.py; that
 both come to the same bits is what a replay shows, whose log Drake has written.
+
+Some blocks may be left out: what they sent is shown as it was recorded (halves.py).
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +18,7 @@ from valve_drake.diagram import OPERATOR, PACKETS, listens, make_blocks, recorde
 from valve_drake.messages import ModeState, OperatorCommand, OperatorPackets
 from valve_drake.ports import SLOT, TICK, Block, Held, Source, Step
 from valve_drake.recording.recorder_system import RecorderSystem
-from valve_drake.recording.signals import JOINED
+from valve_drake.recording.signals import JOINED, topic_of
 from valve_drake.scenario import Scenario
 from valve_drake.stations.replay import Recording, shown
 
@@ -30,7 +33,8 @@ class _Played:
 
     def __init__(self, block: Block[Any, Any]):
         self.block = block
-        self.held = Held(block.initial())
+        self.stepped: Block[Any, Any] | _Shown = block
+        self.held: Any = Held(block.initial())
         self.ports = {port: f"{block.get_name()}.{port}" for port in block.OUTPUTS}
         self.sources: dict[str, Source] = {}
         self.asleep: ModeState | None = None  # in what it was found asleep: it sleeps on while this is the mode
@@ -38,13 +42,44 @@ class _Played:
         self.works = [(_slots(period), _slots(offset), work) for period, offset, work in block.schedule]
 
 
+class _Message:
+    """What a block that is left out sent at one time; read when somebody looks at it."""
+
+    def __init__(self, read: Callable[[], Any]):
+        self._read = read
+
+    @functools.cached_property
+    def value(self) -> Any:
+        return self._read()
+
+
+class _Shown:
+    """Stands for a block that is left out: at its times its ports get what the next tick has recorded of them."""
+
+    def __init__(self, block: Block[Any, Any], recording: Recording):
+        self._sent: dict[int, dict[str, _Message]] = {}  # by the tick that recorded it
+        for port in block.OUTPUTS:
+            for tick, read in recording.sent(topic_of(f"{block.get_name()}.{port}")):
+                self._sent.setdefault(tick, {})[port] = _Message(read)
+
+    def update(self, work: Step, time: float, *_: Any) -> tuple[None, dict[str, _Message]]:
+        return None, self._sent.get(math.floor(time / TICK) + 1, {})
+
+
 class Player:
     """The blocks of a resolved scenario on a recording; `recorder` writes what comes out.
 
+    plays: which blocks are stepped, by name; the others must be recorded whole, by every tick.
     time: up to where it was played [s].
     """
 
-    def __init__(self, scenario: Scenario, recording: Recording, recorder: RecorderSystem):
+    def __init__(
+        self,
+        scenario: Scenario,
+        recording: Recording,
+        recorder: RecorderSystem,
+        plays: Callable[[str], bool] = lambda name: True,
+    ):
         self._recorder, self._groups = recorder, recording.groups
         self._listens = listens(scenario)
         self._slot = 0  # the next one whose updates are due
@@ -52,12 +87,18 @@ class Player:
         self._values: dict[str, Any] = {OPERATOR: OperatorCommand(), PACKETS: OperatorPackets()}
         self._station, self._joined = shown(recording), recording.joined
         blocks = [_Played(block) for block in make_blocks(scenario)]
+        self._left_out = {name for played in blocks if not plays(name := played.block.get_name())}
         for played in blocks:
             for port, value in played.block.initial_outputs().items():
                 self._values[played.ports[port]] = value
         wires = {target: source for source, target in wires_of(scenario)}
         for played in blocks:
             name = played.block.get_name()
+            if name in self._left_out:
+                for port in played.ports.values():
+                    self._values[port] = _Message(functools.partial(lambda value: value, self._values[port]))
+                played.stepped = _Shown(played.block, recording)
+                continue
             for port, declared in played.block.sources.items():
                 read = self._read(wires[f"{name}.{port}"])
                 played.sources[port] = declared._replace(port=_Wired(), evaluate=read)
@@ -104,7 +145,7 @@ class Player:
             for played, offset, work in due[self._slot % len(due)]:  # each reads what was there before
                 if self._slot < offset or played.asleep is mode:
                     continue
-                updated = played.block.update(work, time, played.sources, time, played.held)
+                updated = played.stepped.update(work, time, played.sources, time, played.held)
                 if updated is None:
                     played.asleep = mode
                 else:
@@ -122,6 +163,8 @@ class Player:
         block, _, port = source.partition(".")
         if block == "station":
             return self._station[port]
+        if block in self._left_out:
+            return lambda time: self._values[source].value
         return lambda time: self._values[source]
 
     def _recorded(self, name: str) -> Read | None:

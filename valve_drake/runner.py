@@ -20,7 +20,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
-from valve_drake import config, named_files, outputs, profiling, yaml_file
+from valve_drake import config, halves, named_files, outputs, profiling, yaml_file
 from valve_drake.analysis.comparison import Comparison
 from valve_drake.analysis.metrics import Summary, figures, summarize
 from valve_drake.behaviors.taught import load_taught
@@ -36,7 +36,7 @@ from valve_drake.ports import SLOT, TICK
 from valve_drake.processor import goes_first
 from valve_drake.recording import foxglove, layout
 from valve_drake.recording.reader import LogReader
-from valve_drake.recording.recorder_system import RecorderSystem, Sink, Tee
+from valve_drake.recording.recorder_system import RecorderSystem, Signal, Sink, Tee
 from valve_drake.recording.robot_frames import RobotFrames, pinholes
 from valve_drake.recording.signals import signals
 from valve_drake.recording.writer import LogError, LogWriter
@@ -129,10 +129,15 @@ class Result:
 
 def make_recorder(sink: Sink, scenario: Scenario) -> RecorderSystem:
     """The recorder with all topics of the program."""
+    return RecorderSystem(sink, _table(scenario))
+
+
+def _table(scenario: Scenario) -> list[Signal]:
+    """The recorder's table."""
     head = load_head(named_files.find(scenario, "head_calibration"))
     robot = robot_of(scenario)
     frames = RobotFrames(robot, head)
-    return RecorderSystem(sink, signals(robot.groups, frames, frames.scene, pinholes(head)))
+    return signals(robot.groups, frames, frames.scene, pinholes(head))
 
 
 def run(
@@ -518,26 +523,74 @@ def replay(
         files = stack.enter_context(_files_of(log, scenario, changed))
         data = _read_files(files)
         recording = Recording(log, robot_of(files).groups)
-        comparison = Comparison(log, recording.end)
-        sink: Sink = comparison
-        writer = None
-        if copy is not None:
-            writer = LogWriter(copy, overwrite=overwrite)
-            stack.enter_context(_log_kept(writer))
-            if writer.note:
-                say(writer.note)
-            _begin_log(writer, scenario, data, replay_of=log.path.name)
-            sink = Tee(comparison, writer)
-        player = Player(files, recording, make_recorder(sink, files))
         begin = time.perf_counter()
-        mode = _feed(player, recording, show, begin)
-        comparison.finish()
+        comparison = None if changed or copy is not None else _in_halves(log, files, recording, show)
+        writer = None
+        if comparison is None:
+            comparison = Comparison(log, recording.end)
+            sink: Sink = comparison
+            if copy is not None:
+                writer = LogWriter(copy, overwrite=overwrite)
+                stack.enter_context(_log_kept(writer))
+                if writer.note:
+                    say(writer.note)
+                _begin_log(writer, scenario, data, replay_of=log.path.name)
+                sink = Tee(comparison, writer)
+            player = Player(files, recording, make_recorder(sink, files))
+            mode = _feed(player, recording, _timed(show, begin))
+            comparison.finish()
+            if writer is not None:
+                writer.write_metadata("result", _result_metadata(mode, recording.end))
         wall = time.perf_counter() - begin
-        if writer is not None:
-            writer.write_metadata("result", _result_metadata(mode, recording.end))
     where, error = (writer.where, writer.error) if writer is not None else (None, "")
     notes += _notes(log, recorded, recording, changed)
     return Replay(comparison, recording.end, wall, log.damage, notes, where, error)
+
+
+def _in_halves(
+    log: LogReader, files: Scenario, recording: Recording, show: Callable[[Progress], None]
+) -> Comparison | None:
+    """The comparison of a replay in two processes (halves.py), if it finds everything identical and can be made."""
+
+    table = _table(files)
+    others = halves.topics_beside(table)
+
+    def half(beside: bool, watch: Callable[[ModeState, float], None]) -> Comparison:
+        def mine(topic: str) -> bool:
+            return (topic in others) == beside
+
+        def look(mode: ModeState, now: float) -> None:
+            if comparison.first is not None:
+                raise halves.Different
+            watch(mode, now)
+
+        comparison = Comparison(log, recording.end, mine)
+        recorder = RecorderSystem(comparison, [row for row in table if mine(row.topic)])
+        _feed(Player(files, recording, recorder, halves.plays(beside)), recording, look)
+        comparison.finish()
+        if not comparison.identical:
+            raise halves.Different
+        return comparison
+
+    shown = _timed(show, time.perf_counter())
+    try:
+        with halves.beside(lambda: half(True, lambda mode, now: None).topics) as found:
+
+            def watch(mode: ModeState, now: float) -> None:
+                found(False)
+                shown(mode, now)
+
+            comparison = half(False, watch)
+            topics = comparison.topics | found(True)
+            comparison.topics = {name: topics[name] for name in log.topics if name in topics}
+            return comparison
+    except Exception:  # all blocks together will tell, or fail in the same way
+        return None
+
+
+def _timed(show: Callable[[Progress], None], begin: float) -> Callable[[ModeState, float], None]:
+    """`show` as `_feed` calls it; begin: by the wall's clock."""
+    return lambda mode, now: show(Progress(mode, now, time.perf_counter() - begin))
 
 
 def _recorded_scenario(log: LogReader) -> tuple[Scenario, list[str]]:
@@ -574,13 +627,14 @@ def _files_of(log: LogReader, scenario: Scenario, changed: Collection[str]) -> I
         yield dc.replace(scenario, **files)
 
 
-def _feed(player: Player, recording: Recording, show: Callable[[Progress], None], begin: float) -> ModeState:
-    """Plays to the recording's end; the operator asks when he did in the run (stations/replay.py)."""
+def _feed(player: Player, recording: Recording, show: Callable[[ModeState, float], None]) -> ModeState:
+    """Plays to the recording's end; the operator asks when he did in the run (stations/replay.py). show: is told the
+    mode and the time, every STEP."""
 
     def advance(until: float) -> None:
         while player.time < until:
             player.advance(min(player.time + STEP, until))
-            show(Progress(player.mode, player.time, time.perf_counter() - begin))
+            show(player.mode, player.time)
 
     given: list[tuple[float, Callable[[Any], None], Any]] = []
     given += [(when, player.command, value) for when, value in zip(recording.requests.times, recording.requests.values)]

@@ -4,7 +4,7 @@ import collections
 import dataclasses as dc
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,10 +69,12 @@ class Comparison:
 
     topics: TopicDifference by name, complete after `finish`. first: the first difference in time; of those in one tick,
     the one whose topic was the first in the log. That is the order of the recorder's table, in which data flows.
+    of: which topics are compared, by name, of those that are not UNCOMPARED.
     """
 
-    def __init__(self, log: LogReader, end: float):
-        self.topics = {name: TopicDifference() for name in log.topics if not name.startswith(UNCOMPARED)}
+    def __init__(self, log: LogReader, end: float, of: Callable[[str], bool] = lambda topic: True):
+        names = (name for name in log.topics if not name.startswith(UNCOMPARED) and of(name))
+        self.topics = {name: TopicDifference() for name in names}
         self.first: Divergence | None = None
         self._log = log
         self._kinds: dict[str, type[Proto]] = {}  # that were written, by topic

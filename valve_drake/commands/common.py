@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from valve_drake.runner import Progress
 
 OK, FAILED, BAD_INPUT, DAMAGED = 0, 1, 2, 3  # exit codes
+REFRESH = 0.1  # of the live line; raise it for a slow terminal [s]
 ECHO = 0.3  # a signal repeated within this time counts once: a closing terminal and `timeout` send two [s]
 Subcommands: TypeAlias = "argparse._SubParsersAction[Parser]"
 
@@ -135,17 +136,27 @@ def display(wanted: bool) -> Iterator[Callable[["Progress"], None]]:
     if not wanted or not console.is_terminal:
         yield lambda progress: None
         return
-    with console.status("starting") as status:
-        last = [""]
+    from rich.live import Live
+    from rich.spinner import Spinner
+
+    spinner = Spinner("dots", "starting")
+    # Without rich's thread, beside which this process could not be copied (beside.py).
+    with Live(spinner, console=console, auto_refresh=False, transient=True) as live:
+        mode, shown = "", 0.0
 
         def show(progress: "Progress") -> None:
-            mode = progress.mode
-            factor = progress.sim_time / max(progress.wall_time, 1e-9)
-            times = f"  {progress.sim_time:6.2f} s  x{factor:.2f} real time"
-            status.update(styled((mode.mode, "bold"), times))
-            if mode.mode != last[0]:
-                console.print(styled(f"{mode.since:7.2f} s  ", (f"{mode.mode:<15}", "bold"), f" {mode.reason}"))
-                last[0] = mode.mode
+            nonlocal mode, shown
+            if progress.mode.mode != mode:
+                mode = progress.mode.mode
+                since, reason = f"{progress.mode.since:7.2f} s  ", f" {progress.mode.reason}"
+                console.print(styled(since, (f"{mode:<15}", "bold"), reason))
+            now = time.monotonic()
+            if now - shown > REFRESH:
+                factor = progress.sim_time / max(progress.wall_time, 1e-9)
+                times = f"  {progress.sim_time:6.2f} s  x{factor:.2f} real time"
+                spinner.update(text=styled((mode, "bold"), times))
+                live.refresh()
+                shown = now
 
         yield show
 

@@ -53,12 +53,14 @@ class PlantSystem(PythonSystem):
     port                             dir  type       notes
     -------------------------------  ---  ---------  ---------------------------------------------------------------
     (the station's inputs)           in   vector     as in stations/contract.py
-    state                            out  vector     positions and velocities of `plant`
-    actuation                        out  vector     of the robot's actuators in the last step, by index [N m, N]
-    left, right, stem                out  vector(6)  [torque; force] of the joint on its child in the last step, in
+    now                              out  vector     all of the state, in parts: `parts` has the slice of each
+      of it: state                        vector     positions and velocities of `plant`
+      base                                vector(3)  the base's set point x, y, heading [m, rad]
+      actuation                           vector     of the robot's actuators in the last step, by index [N m, N]
+      left, right, stem                   vector(6)  [torque; force] of the joint on its child in the last step, in
                                                      the child's frame: the wrist sensors and the valve's stem
-    left_opening, right_opening      out  vector(1)  between the pads [m]
-    left_grip, right_grip            out  vector(1)  force of the finger actuator that closes, in the last step [N]
+      left_opening, right_opening         vector(1)  between the pads [m]
+      left_grip, right_grip               vector(1)  force of the finger actuator that closes, in the last step [N]
     contacts                         out  Contacts   what touched what in the last step, a look every 1/16 s
 
     Slot 2 of tick k finds the commands of tick k - 1 at its ports, since command_selector replaces them at the same
@@ -149,26 +151,22 @@ class PlantSystem(PythonSystem):
         loaded = {side: robot.description.arm(side).sensor for side in SIDES} | {STEM: STEM}  # output port -> joint
         present = list(self.plant.GetJointIndices())  # a welded joint has left its index unused
         self._loads = [present.index(self.plant.GetJointByName(name).index()) for name in loaded.values()]
-        self._x = self.DeclareDiscreteState(self.plant.GetPositionsAndVelocities(self._inner))
-        self._base = self.DeclareDiscreteState([start[name] for name in self.base])
-        self._actuation = self.DeclareDiscreteState(len(self.actuated))  # of the robot's actuators, in the last step
-        self._load = [self.DeclareDiscreteState(6) for _ in loaded]  # [torque; force], in the last step
-        nx = self.plant.num_multibody_states()
-        still = self._measured_grips(self.plant.GetPositionsAndVelocities(self._inner), np.zeros(len(joints)))
-        self._grip = [self.DeclareDiscreteState([value]) for value in still]
-        wrenches, numbers = [6] * len(loaded), [1] * len(still)
+        x = self.plant.GetPositionsAndVelocities(self._inner)
+        base = [start[name] for name in self.base]
+        grips = [f"{side}_{what}" for side in SIDES for what in ("opening", "grip")]
+        counts = {"state": len(x), "base": len(base), "actuation": len(joints)}
+        counts |= {**dict.fromkeys(loaded, 6), **dict.fromkeys(grips, 1)}
+        ends = list(itertools.accumulate(counts.values()))
+        self.parts = {name: slice(end - counts[name], end) for name, end in zip(counts, ends)}  # of port `now`
+        self.size = ends[-1]  # of it
+        still = [np.zeros(ends[-1] - ends[1] - len(grips)), self._measured_grips(x, np.zeros(len(joints)))]
+        self._now = self.DeclareDiscreteState(np.concatenate([x, base, *still]))
+        self.DeclareStateOutputPort("now", self._now)
         self._contacts = self.DeclareAbstractState(Value(contacts.NONE))
-        makes = [nx, len(self.base), len(self.actuated), *wrenches, *numbers, contacts.SIZE]  # sizes, in a tick
-        self._parts = makes
-        self._ends = list(itertools.accumulate([nx, len(self.base), 1, *sizes.values()]))  # in what it is made of
-        self._beside: Beside | None = None
-        self.DeclareStateOutputPort("state", self._x)
-        self.DeclareStateOutputPort("actuation", self._actuation)
         self.DeclareStateOutputPort("contacts", self._contacts)
-        for name, index in zip(loaded, self._load):
-            self.DeclareStateOutputPort(name, index)
-        for name, index in zip((f"{side}_{what}" for side in SIDES for what in ("opening", "grip")), self._grip):
-            self.DeclareStateOutputPort(name, index)
+        self._kept = ends[1]  # how much of it the next tick depends on
+        self._ends = list(itertools.accumulate([self._kept, 1, *sizes.values()]))  # of the parts of a question
+        self._beside: Beside | None = None
         self.DeclarePeriodicUnrestrictedUpdateEvent(TICK, 2 * SLOT, self._update)
         self.DeclarePeriodicPublishEvent(TICK, 3 * SLOT, self._begin)
 
@@ -178,7 +176,8 @@ class PlantSystem(PythonSystem):
         it is in. Outputs that depend on forces are those of the step to come.
         """
         context = self.GetMyContextFromRoot(root)
-        x, base = (context.get_discrete_state(index).value() for index in (self._x, self._base))
+        now = context.get_discrete_state(self._now).value()
+        x, base = now[self.parts["state"]], now[self.parts["base"]]
         inner = self.diagram.CreateDefaultContext()
         inner.SetTime(context.get_time())
         plant_context = self.plant.GetMyMutableContextFromRoot(inner)
@@ -248,7 +247,7 @@ class PlantSystem(PythonSystem):
     @contextlib.contextmanager
     def beside(self) -> Iterator[Beside]:
         """While open, the plant is advanced beside the blocks, in a copy of this process where one can be made."""
-        with Beside(self._advance, self._ends[-1], sum(self._parts)) as self._beside:
+        with Beside(self._advance, self._ends[-1], self.size + contacts.SIZE) as self._beside:
             try:
                 yield self._beside
             finally:
@@ -256,10 +255,8 @@ class PlantSystem(PythonSystem):
 
     def _question(self, context: Context) -> np.ndarray:
         """All that the next tick depends on: x, the base's set point, whether contacts are looked at, the commands."""
-        state = context.get_discrete_state()
-        look = [float(self._looks(context))]
-        parts = (state.value(self._x), state.value(self._base), look, *(read(context) for read in self._reads))
-        return np.concatenate(parts)
+        now = context.get_discrete_state(self._now).value()[: self._kept]
+        return np.concatenate([now, [float(self._looks(context))], *[read(context) for read in self._reads]])
 
     @staticmethod
     def _looks(context: Context) -> bool:
@@ -275,18 +272,15 @@ class PlantSystem(PythonSystem):
         with profiling.work(profiling.PLANT):
             question = self._question(context)
             answer = self._advance(question) if self._beside is None else self._beside.answer(question)
-        values = state.get_mutable_discrete_state()
-        start = 0
-        for index, size in zip((self._x, self._base, self._actuation, *self._load, *self._grip), self._parts):
-            values.set_value(index, answer[start : start + size])
-            start += size
+        state.get_mutable_discrete_state().set_value(self._now, answer[: self.size])
         if self._looks(context):
             kept = state.get_mutable_abstract_state().get_mutable_value(self._contacts)
-            kept.set_value(self._reader.message(answer[start:], _made(context) * TICK, kept.get_value()))
+            kept.set_value(self._reader.message(answer[self.size :], _made(context) * TICK, kept.get_value()))
 
     def _advance(self, question: np.ndarray) -> np.ndarray:
-        """One tick. It depends on the question alone -> x, the base's set point, actuation, loads, grips, contacts."""
-        x, base, look, *commands = (question[a:b] for a, b in itertools.pairwise((0, *self._ends)))
+        """One tick -> all of the state after it, and contacts. It depends on the question alone."""
+        kept, look, *commands = (question[a:b] for a, b in itertools.pairwise((0, *self._ends)))
+        x, base = kept[self.parts["state"]], kept[self.parts["base"]]
         with self._lock:
             return np.concatenate(self._step(x, base, bool(look[0]), dict(zip(self._inputs, commands))))
 

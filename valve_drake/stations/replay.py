@@ -20,7 +20,7 @@ import collections
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from pydrake.common.value import Value
@@ -108,6 +108,12 @@ class Recording:
             for time, frame in track.values:
                 if frame.sequence >= 0 and time <= self.end and (f"/{camera}/image", time) not in images:
                     raise ConfigError(f"{log.path} lacks the image {frame.sequence} of {camera} at t = {time:.3f} s")
+
+    def sent(self, topic: str) -> Iterator[tuple[int, Callable[[], Any]]]:
+        """The messages of a topic, none if the log lacks it: the tick that recorded each, and what reads it."""
+        if topic in self._log.topics:
+            for record in self._log.records([topic]):
+                yield round(record.time / TICK), functools.partial(self._log.decode, record)
 
     def frame(self, time: float, header: CameraFrame) -> CameraFrame:
         """The frame with its image, as recorded at `time`."""

@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import AffineSystem, MatrixGain
+from pydrake.systems.primitives import AffineSystem, Demultiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from valve_drake.camera.lens import Lens, StereoHead
@@ -25,17 +25,11 @@ from valve_drake.robot.robot import Robot
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, TRUTH, check_contract
-from valve_drake.stations.plant_system import COMMANDS, PlantSystem
+from valve_drake.stations.plant_system import COMMANDS, STEM, PlantSystem
 from valve_drake.stations.scene import add_scene, panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig, ValveConfig
 from valve_drake.valve.model import marker_frame
 from valve_drake.valve.valve import Valve
-
-
-def _affine(gain: np.ndarray, offset: np.ndarray) -> AffineSystem:
-    """y = gain u + offset, in C++."""
-    none, (n, m) = np.zeros((0, 0)), gain.shape
-    return AffineSystem(none, np.zeros((0, m)), np.zeros(0), np.zeros((n, 0)), gain, offset)
 
 
 def arm_offsets(error: ErrorConfig, seed: int, robot: Robot) -> dict[str, np.ndarray]:
@@ -238,22 +232,46 @@ def rig_arguments(
     return mounts, simulation.valve, shape, simulation.light, simulation.camera, seed, robot
 
 
+POSITIONS, BASE = "positions", "base"  # of the plant; of the base, with their rates: what the station measures inside
+
+
 def _select(physics: PlantSystem, joints: Sequence[str], what: str) -> np.ndarray:
-    """0/1 matrix that picks these joints of the robot out of the plant's state ("position", "velocity") or actuation
-    ("torque")."""
-    plant = physics.plant
-    if what == "torque":
-        columns, width = [physics.actuated.index(name) for name in joints], len(physics.actuated)
+    """0/1 matrix that picks a "position", "velocity" or "torque" of each of these joints out of the plant's `now`."""
+    plant, parts = physics.plant, physics.parts
+    found = [plant.GetJointByName(name, physics.robot) for name in joints]
+    if what == "position":
+        columns = [parts["state"].start + joint.position_start() for joint in found]
+    elif what == "velocity":
+        columns = [parts["state"].start + plant.num_positions() + joint.velocity_start() for joint in found]
     else:
-        found = [plant.GetJointByName(name, physics.robot) for name in joints]
-        width = plant.num_multibody_states()
-        if what == "position":
-            columns = [joint.position_start() for joint in found]
-        else:
-            columns = [plant.num_positions() + joint.velocity_start() for joint in found]
-    picked = np.zeros((len(joints), width))
+        columns = [parts["actuation"].start + physics.actuated.index(name) for name in joints]
+    picked = np.zeros((len(joints), parts[STEM].stop))
     picked[range(len(joints)), columns] = 1
     return picked
+
+
+def _measured(
+    builder: DiagramBuilder, now: OutputPort, rows: Mapping[str, tuple[np.ndarray, np.ndarray | float]]
+) -> dict[str, OutputPort]:
+    """A port for each of the rows: matrix @ `now` + offset. One system in C++ makes all: each costs at every event."""
+    matrix = np.vstack([gain for gain, _ in rows.values()])
+    offset = np.concatenate([np.broadcast_to(zero, len(gain)) for gain, zero in rows.values()])
+    none, (n, m) = np.zeros((0, 0)), matrix.shape
+    sensors = AffineSystem(none, np.zeros((0, m)), np.zeros(0), np.zeros((n, 0)), matrix, offset)
+    builder.AddNamedSystem("sensors", sensors)
+    builder.Connect(now, sensors.get_input_port())
+    ends = dict(zip(rows, np.cumsum([len(gain) for gain, _ in rows.values()]).tolist()))
+    parts = {name: slice(end - len(rows[name][0]), end) for name, end in ends.items()}
+    return _demultiplexed(builder, "sensor_ports", sensors.get_output_port(), parts)
+
+
+def _demultiplexed(
+    builder: DiagramBuilder, name: str, port: OutputPort, parts: Mapping[str, slice]
+) -> dict[str, OutputPort]:
+    """A port for each part of a vector; the parts follow each other and are all of it."""
+    split = builder.AddNamedSystem(name, Demultiplexer([part.stop - part.start for part in parts.values()]))
+    builder.Connect(port, split.get_input_port(0))
+    return {part: split.get_output_port(k) for k, part in enumerate(parts)}
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -303,61 +321,55 @@ def make_simulated_station(
     valve = simulation.valve
     offsets = arm_offsets(simulation.error, seed, robot)
     physics = builder.AddSystem(make_plant(simulation, shape, robot, seed) if physics is None else physics)
-    state, plant = physics.GetOutputPort("state"), physics.plant
+    plant, now = physics.plant, physics.GetOutputPort("now")
     for name in COMMANDS:
         builder.ExportInput(physics.GetInputPort(name), name)
-
-    def measure(port: str, joints: Sequence[str], what: str, offset: np.ndarray | None = None) -> None:
-        matrix = _select(physics, joints, what)
-        gain = builder.AddSystem(MatrixGain(matrix) if offset is None else _affine(matrix, offset))
-        gain.set_name(port)
-        builder.Connect(physics.GetOutputPort("actuation") if what == "torque" else state, gain.get_input_port())
-        builder.ExportOutput(gain.get_output_port(), port)
-
-    measure("torso.position_measured", robot.torso.names, "position")
+    part = _demultiplexed(builder, "plant_parts", now, physics.parts)
+    measured: dict[str, tuple[np.ndarray, np.ndarray | float]] = {
+        POSITIONS: (np.eye(plant.num_positions(), physics.size), 0.0),
+        BASE: (np.vstack([_select(physics, robot.base.names, what) for what in ("position", "velocity")]), 0.0),
+        "torso.position_measured": (_select(physics, robot.torso.names, "position"), 0.0),
+    }
     for side in SIDES:
         joints = robot.arms[side].names
-        measure(f"{side}_arm.position_measured", joints, "position", offset=offsets[side])
-        measure(f"{side}_arm.velocity_measured", joints, "velocity")
-        measure(f"{side}_arm.torque_measured", joints, "torque")
-        builder.ExportOutput(physics.GetOutputPort(f"{side}_opening"), f"{side}_gripper.position_measured")
-        builder.ExportOutput(physics.GetOutputPort(f"{side}_grip"), f"{side}_gripper.force_measured")
+        measured[f"{side}_arm.position_measured"] = _select(physics, joints, "position"), offsets[side]
+        measured[f"{side}_arm.velocity_measured"] = _select(physics, joints, "velocity"), 0.0
+        measured[f"{side}_arm.torque_measured"] = _select(physics, joints, "torque"), 0.0
+        builder.ExportOutput(part[f"{side}_opening"], f"{side}_gripper.position_measured")
+        builder.ExportOutput(part[f"{side}_grip"], f"{side}_gripper.force_measured")
+    ports = _measured(builder, now, measured)
+    for name in measured.keys() - {POSITIONS, BASE}:
+        builder.ExportOutput(ports[name], name)
 
-    moves = np.vstack([_select(physics, robot.base.names, what) for what in ("position", "velocity")])
-    moving = builder.AddNamedSystem("base_state", MatrixGain(moves))
-    builder.Connect(state, moving.get_input_port())
     odometry = builder.AddSystem(OdometrySystem(simulation.error, seed))
-    builder.Connect(moving.get_output_port(), odometry.GetInputPort("base"))
+    builder.Connect(ports[BASE], odometry.GetInputPort("base"))
     builder.ExportOutput(odometry.GetOutputPort("odometry"), "base.odometry")
 
     wrench = builder.AddSystem(WrenchSensorSystem(simulation.error, seed))
     for side in SIDES:
-        builder.Connect(physics.GetOutputPort(side), wrench.GetInputPort(f"{side}_load"))
+        builder.Connect(part[side], wrench.GetInputPort(f"{side}_load"))
         builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
 
     camera = simulation.camera
     images = CameraRig(*rig_arguments(simulation, shape, head, seed, robot.description)) if workers is None else workers
-    positions = builder.AddSystem(MatrixGain(np.eye(plant.num_positions(), plant.num_multibody_states())))
-    positions.set_name("positions")
-    builder.Connect(state, positions.get_input_port())
     for name in CAMERAS:
         period = camera.head_period if name.startswith("head") else camera.wrist_period
         system = builder.AddSystem(CameraSystem(name, plant.num_positions(), period, camera.latency, images))
-        builder.Connect(positions.get_output_port(), system.GetInputPort("positions"))
+        builder.Connect(ports[POSITIONS], system.GetInputPort("positions"))
         builder.ExportOutput(system.GetOutputPort("image"), f"{name}.image")
 
     health = builder.AddSystem(HealthSystem())
     builder.ExportOutput(health.GetOutputPort("health"), "health")
 
     truth = builder.AddSystem(TruthSystem(physics, valve, shape.sense))
-    builder.Connect(state, truth.GetInputPort("state"))
-    builder.Connect(physics.GetOutputPort("stem"), truth.GetInputPort("stem_load"))
+    builder.Connect(part["state"], truth.GetInputPort("state"))
+    builder.Connect(part[STEM], truth.GetInputPort("stem_load"))
     for name in TruthSystem.OUTPUTS:
         builder.ExportOutput(truth.GetOutputPort(name), TRUTH + name)
     builder.ExportOutput(physics.GetOutputPort("contacts"), TRUTH + "contacts")
 
     if meshcat is not None:
-        view = _add_view(builder, positions.get_output_port(), valve, shape, meshcat, robot.description)
+        view = _add_view(builder, ports[POSITIONS], valve, shape, meshcat, robot.description)
         physics.view = view  # lives as long
     station = builder.Build()
     station.set_name("simulated")
