@@ -69,7 +69,7 @@ class Hands:
         for k in range(1, round(time / SLOW) + 1):
             self.command(arms(k * SLOW / time))
             self.simulator.AdvanceTo(begin + k * SLOW)
-            angle = self.plant.GetOutputPort("state").Eval(self.context)[self._angle]
+            angle = self.plant.GetOutputPort("now").Eval(self.context)[self._angle]
             self.kept.append((begin + k * SLOW, angle, self.plant.GetOutputPort("contacts").Eval(self.context)))
         return self
 

@@ -245,7 +245,7 @@ def _select(physics: PlantSystem, joints: Sequence[str], what: str) -> np.ndarra
         columns = [parts["state"].start + plant.num_positions() + joint.velocity_start() for joint in found]
     else:
         columns = [parts["actuation"].start + physics.actuated.index(name) for name in joints]
-    picked = np.zeros((len(joints), parts[STEM].stop))
+    picked = np.zeros((len(joints), physics.size))
     picked[range(len(joints)), columns] = 1
     return picked
 
