@@ -4,6 +4,7 @@ import concurrent.futures
 import csv
 import io
 import json
+import math
 import os
 import signal
 import subprocess
@@ -12,11 +13,12 @@ import textwrap
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from markupsafe import escape
 
 from valve_drake import cli
-from valve_drake.campaign import campaign, comparison, executors, report, statistics, trial
+from valve_drake.campaign import campaign, comparison, executors, failures, hunting, report, statistics, trial
 from valve_drake.campaign.campaign import Campaign
 from valve_drake.campaign.trial import Trial, perform, turned
 from valve_drake.checks import ConfigError, OperationFailed
@@ -109,12 +111,15 @@ def test_differences_come_with_students_interval():
 
 
 def test_every_trial_has_its_seed_its_draws_and_its_command(tmp_path):
-    trials = wanted(tmp_path, 3, 40).trials()
+    def trials_of():
+        return [trial for batch in wanted(tmp_path, 3, 40).batches({}) for trial in batch]
+
+    trials = trials_of()
     assert [t.seed for t in trials] == [40, 41, 42]
     assert trials[0].command() == ["valve-drake", "run", "simulated.scenario.yaml", "--seed", "40"]
     draws = [dict(t.draws) for t in trials]
     assert "simulation.valve.friction" in draws[0] and draws[0] != draws[1]
-    assert draws == [dict(t.draws) for t in wanted(tmp_path, 3, 40).trials()]
+    assert draws == [dict(t.draws) for t in trials_of()]
 
 
 def test_a_campaign_leaves_a_record_a_run_and_the_logs_of_failures(tmp_path, fake):
@@ -248,6 +253,121 @@ def test_an_interrupt_ends_the_runs_that_are_under_way(tmp_path, fake, monkeypat
     assert time.monotonic() - start < 10 and campaign.read_all(tmp_path / "out") == []
 
 
+# ---------------------------------------------------------------- hunting
+
+# Stands for a program that fails where friction is high and the valve low, and is close to it round there.
+EDGE = """
+import json, sys
+words = sys.argv[1:]
+draws = dict(w.split("=") for w in words if w.startswith("simulation."))
+seed, log = int(words[words.index("--seed") + 1]), words[words.index("--log") + 1]
+high = (float(draws["simulation.valve.friction"]) - 2.5) / 4.8
+low = (1.22 - float(draws["simulation.valve.height"])) / 0.41
+far = max(1 - high, 1 - low)
+open(log, "wb").write(b"log")
+good = far > 0.2
+numbers = {"outcome": "done" if good else "failed", "verdict": "turned" if good else "stuck", "reason": "",
+    "mode_durations_s": {"turn": 2.0}, "turn_peak_hand_force_N": 55 * (1 - far), "processor_s": {"total": 1.0}}
+print(json.dumps(numbers))
+"""
+
+
+@pytest.fixture
+def edge(tmp_path, monkeypatch):
+    program = tmp_path / "edge.py"
+    program.write_text(EDGE)
+    monkeypatch.setattr(trial, "PROGRAM", (sys.executable, "-S", str(program)))
+
+
+def test_a_hunt_finds_the_corner_where_runs_fail(tmp_path, edge):
+    records = run(wanted(tmp_path / "out", 48, hunt=True))
+    failed = [k for k, record in enumerate(records) if not turned(record)]
+    assert len(failed) >= 8  # 4 % of the room: even draws would find two
+    assert sum(k >= 24 for k in failed) > sum(k < 24 for k in failed)
+    assert records[0]["command"][-1].startswith("simulation.")  # says its draws, to be run again
+    draws = records[failed[0]]["draws"]
+    assert f"simulation.valve.friction={draws['simulation.valve.friction']!r}" in records[failed[0]]["command"]
+
+
+def test_a_hunt_that_is_broken_off_goes_on_as_it_would_have_gone(tmp_path, edge):
+    whole = run(wanted(tmp_path / "whole", 20, hunt=True))
+    run(wanted(tmp_path / "parts", 11, hunt=True))
+    (tmp_path / "parts/records/simulated-3.json").unlink()
+    parts = run(wanted(tmp_path / "parts", 20, hunt=True), jobs=1)
+    assert [r | {"times": 0} for r in parts] == [r | {"times": 0} for r in whole]
+    other = run(wanted(tmp_path / "other", 8, first=50, hunt=True))
+    assert other[0]["draws"] != whole[0]["draws"]
+
+
+def test_hunts_and_campaigns_do_not_share_a_folder_and_a_hunt_needs_a_distribution(tmp_path, edge):
+    run(wanted(tmp_path / "out", 2, hunt=True))
+    with pytest.raises(ConfigError, match=r"holds a campaign of other draws \(--hunt\)"):
+        run(wanted(tmp_path / "out", 2))
+    plain = tmp_path / "plain.yaml"
+    plain.write_text("command: open\n")
+    with pytest.raises(ConfigError, match="nothing to hunt in"):
+        campaign.Campaign((str(plain),), 2, 1, (), tmp_path / "none", hunt=True).check()
+
+
+def test_proposals_stay_within_the_ranges_and_explore():
+    seen = [(np.array([0.99, 0.01]), 0.0)] * 4 + [(np.array([0.5, 0.5]), 1.0)] * 16
+    found = np.concatenate([hunting.propose(seen, 8, 2, 1, k) for k in range(30)])
+    assert found.min() >= 0 and found.max() <= 1
+    near = np.abs(found - [0.99, 0.01]).max(axis=1) < 0.1
+    assert 0.55 < near.mean() < 0.8
+
+
+@pytest.mark.parametrize(
+    "change, left",
+    [
+        ({}, 1.0),
+        ({"outcome": "failed"}, 0.0),
+        ({"valve_angle_true_rad": 1.0 + math.radians(1.5)}, 0.5),
+        ({"contact_honesty": {"left": 1.0, "right": 0.96}}, 0.2),
+        ({"turn_peak_hand_force_N": 44.0}, 0.2),
+        ({"retries": 9}, 0.0),
+    ],
+)
+def test_a_runs_margin_is_what_its_worst_figure_leaves(change, left):
+    record = {"outcome": "done", "verdict": "turned", "valve_angle_command_rad": 1.0, "valve_angle_true_rad": 1.0}
+    assert hunting.margin(record | change) == pytest.approx(left)
+
+
+def test_failures_are_a_list_that_is_run_again(tmp_path, edge, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["campaign", "--hunt", "--runs", "32", "--out", "hunt", "--jobs", "4", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["failures"]
+    entries = failures.read(Path("hunt/failures.yaml"))
+    assert [entry.seed for entry in entries] == [row["seed"] for row in found] and len(entries) > 2
+    assert all(entry.ended.startswith("stuck in turn") for entry in entries)
+    assert cli.main(["campaign", "--again", "hunt/failures.yaml", "--runs", "2", "--out", "again", "--json"]) == 1
+    numbers = json.loads(capsys.readouterr().out)
+    assert (numbers["runs"], numbers["turned"]) == (2, 0)
+    assert [row["seed"] for row in numbers["failures"]] == [row["seed"] for row in found[:2]]
+    (tmp_path / "edge.py").write_text(EDGE.replace("far > 0.2", "True"))  # mended
+    assert cli.main(["campaign", "--again", "hunt/failures.yaml", "--runs", "2", "--out", "mended", "--json"]) == 0
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("", "not a list of failures"),
+        ("failures: []", "not a list of failures"),
+        ("failures: [{seed: -1}]", "failures[0].seed must be within"),
+        ("failures: [{seed: 1, sed: []}]", "sed"),
+        ("failures: [{seed: 1, set: [what]}]", "--set must be key=value"),
+        ("failures: [{scenario: none.yaml}]", "none.yaml"),
+    ],
+)
+def test_a_wrong_list_of_failures_is_one_line(tmp_path, monkeypatch, capsys, text, words):
+    monkeypatch.chdir(tmp_path)
+    Path("list.yaml").write_text(text)
+    assert cli.main(["campaign", "--again", "list.yaml"]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and words in lines[0], lines
+    assert [path.name for path in tmp_path.iterdir()] == ["list.yaml"]
+
+
 # ---------------------------------------------------------------- refusals
 
 
@@ -287,6 +407,8 @@ def test_two_campaigns_do_not_share_a_folder(tmp_path, fake):
         (["simulated.scenario.yaml", "simulated"], "two scenarios are called simulated"),
         (["nothing.yaml"], "nothing.yaml"),
         (["--time-out", "0"], "--time-out must be above 0"),
+        (["--again", "a.yaml", "--hunt"], "--again goes with no scenario and no --hunt"),
+        (["--again", "a.yaml"], "a.yaml"),
         (["compare", "a"], "campaign compare takes the folders of two campaigns, got 1"),
         (["compare", "a", "b"], "a: not the folder of a campaign"),
     ],

@@ -5,21 +5,27 @@
     OUT/logs/NAME-SEED.mcap     the logs that are kept
 
 A trial without a record has not been run: it is run again from its beginning, so that none is lost and none counts
-twice. Where the trials run is an executor's matter: threads that wait for processes here, or workers of Dask.
+twice. A campaign may choose what is drawn itself (`hunt`), or run a list of failures again. Where the trials run is an
+executor's matter: threads that wait for processes here, or workers of Dask.
 """
 
 import concurrent.futures
 import contextlib
 import dataclasses as dc
 import fcntl
+import itertools
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from valve_drake import config, outputs, scenario
+from valve_drake.campaign import hunting
+from valve_drake.campaign.failures import Failure
 from valve_drake.campaign.statistics import interval
 from valve_drake.campaign.trial import Record, Trial, perform, turned
 from valve_drake.checks import ConfigError, OperationFailed, require
@@ -29,11 +35,16 @@ from valve_drake.versions import versions
 PLAN, RECORDS, LOGS = "campaign.json", "records", "logs"
 SAMPLE = 50  # of the turned runs, the log of every so many'th seed is kept as well, unless none are
 MOST = 100_000  # runs of one campaign
+MANY = 256  # trials that wait for an executor at a time
 
 
 @dc.dataclass(frozen=True)
 class Campaign:
-    """What is run. scenarios: names or files, each with seeds first_seed .. first_seed + runs - 1."""
+    """What is run. scenarios: names or files, each with seeds first_seed .. first_seed + runs - 1.
+
+    hunt: draws are chosen where failures are likely (hunting.py), instead of by the seeds. again: failures that are run
+    again, in place of scenarios and seeds.
+    """
 
     scenarios: tuple[str, ...]
     runs: int
@@ -42,28 +53,78 @@ class Campaign:
     out: Path
     keep: str = "failed"
     time_out: float = 900.0  # of one run, by the wall's clock [s]
+    hunt: bool = False
+    again: tuple[Failure, ...] = ()
 
-    def trials(self) -> list[Trial]:
-        """All of them, in order. Raises ConfigError for a wrong scenario, or two with one name."""
+    @property
+    def total(self) -> int:
+        return len(self.again) or len(self.scenarios) * self.runs
+
+    @property
+    def named(self) -> dict[str, tuple[str, tuple[str, ...]]]:
+        """Name of each scenario -> its file, overrides. Raises ConfigError for two with one name."""
+        if self.again:
+            return {
+                f"{name_of(entry.scenario)}.{k}": (entry.scenario, (*entry.set, *self.overrides))
+                for k, entry in enumerate(self.again)
+            }
+        names = [name_of(path) for path in self.scenarios]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ConfigError(f"campaign: two scenarios are called {twice}: their records would be one")
+        return {name: (path, self.overrides) for name, path in zip(names, self.scenarios)}
+
+    def check(self) -> None:
+        """Raises ConfigError: numbers out of range, a wrong scenario, two with one name, nothing to hunt in."""
         require(1 <= self.runs <= MOST, "--runs", f"within 1 and {MOST}", self.runs)
         last = self.first_seed + self.runs - 1
         require(
             0 <= self.first_seed and last < 2**31, "--first-seed", "0 or more, the last below 2^31", self.first_seed
         )
-        names = [name_of(path) for path in self.scenarios]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise ConfigError(f"campaign: two scenarios are called {twice}: their records would be one")
-        trials = []
-        for name, path in zip(names, self.scenarios):
-            given = scenario.load(path, self.overrides)
+        for path, overrides in self.named.values():
+            given = scenario.load(path, overrides)
             wire = given.operator_channel.wire
             require(wire == "none", "operator_channel.wire", "none in a campaign: its runs wait for nobody", wire)
-            for seed in range(self.first_seed, self.first_seed + self.runs):
-                log = (self.out / LOGS / f"{name}-{seed}.mcap").resolve()
-                draws = drawn(dc.replace(given, seed=seed))
-                trials.append(Trial(name, path, seed, self.overrides, draws, log, self.time_out))
-        return trials
+            if self.hunt and not _ranges(given):
+                raise ConfigError(f"{path}: there is nothing to hunt in: no key has a distribution")
+
+    def batches(self, records: Mapping[str, Record]) -> Iterator[list[Trial]]:
+        """All trials in their order, a batch at a time; of a hunt, each by the records of those before it.
+
+        records: by the trials' keys, filled in between the batches. Raises ConfigError as `check` does.
+        """
+        self.check()
+        for (name, (path, overrides)), entry in itertools.zip_longest(self.named.items(), self.again):
+            given = scenario.load(path, overrides)
+            if self.hunt:
+                yield from self._hunted(name, path, given, records)
+            elif entry is not None:
+                yield [self._trial(name, path, given, entry.seed, overrides)]
+            else:
+                seeds = range(self.first_seed, self.first_seed + self.runs)
+                yield [self._trial(name, path, given, seed, overrides) for seed in seeds]
+
+    def _hunted(
+        self, name: str, path: str, given: scenario.Scenario, records: Mapping[str, Record]
+    ) -> Iterator[list[Trial]]:
+        ranges = _ranges(given)
+        low, high = np.array([[r.min, r.max] for r in ranges.values()]).T
+        seen: list[tuple[np.ndarray, float]] = []
+        for batch, first in enumerate(range(0, self.runs, hunting.BATCH)):
+            places = hunting.propose(seen, hunting.BATCH, len(ranges), self.first_seed, batch)
+            trials = []
+            for k, place in enumerate(places[: self.runs - first]):
+                drawn_here = (f"{key}={value!r}" for key, value in zip(ranges, (low + place * (high - low)).tolist()))
+                overrides = (*self.overrides, *drawn_here)
+                trials.append(self._trial(name, path, given, self.first_seed + first + k, overrides))
+            yield trials
+            seen += [(place, hunting.margin(records[trial.key])) for place, trial in zip(places, trials)]
+
+    def _trial(self, name: str, path: str, given: scenario.Scenario, seed: int, overrides: tuple[str, ...]) -> Trial:
+        """given: the scenario with its distributions; what they come to is what the trial draws."""
+        log = (self.out / LOGS / f"{name}-{seed}.mcap").resolve()
+        resolved = scenario.resolve(dc.replace(scenario.with_overrides(given, overrides), seed=seed))
+        return Trial(name, path, seed, overrides, drawn(given, resolved), log, self.time_out)
 
 
 def name_of(path: str) -> str:
@@ -71,10 +132,19 @@ def name_of(path: str) -> str:
     return Path(path).name.split(".")[0]
 
 
-def drawn(given: scenario.Scenario) -> tuple[tuple[str, float], ...]:
-    """What the seed draws: key and value of every distribution of a scenario."""
-    resolved = {leaf.key: leaf.value for leaf in config.leaves(scenario.resolve(given))}
-    return tuple((leaf.key, resolved[leaf.key]) for leaf in config.leaves(given) if isinstance(leaf.value, Uniform))
+def _ranges(given: scenario.Scenario) -> dict[str, Uniform]:
+    """The distributions of a scenario that leave something to choose, by key."""
+    return {
+        leaf.key: leaf.value
+        for leaf in config.leaves(given)
+        if isinstance(leaf.value, Uniform) and leaf.value.max > leaf.value.min
+    }
+
+
+def drawn(given: scenario.Scenario, resolved: scenario.Scenario) -> tuple[tuple[str, float], ...]:
+    """What was drawn: key and value of every distribution of a scenario."""
+    values = {leaf.key: leaf.value for leaf in config.leaves(resolved)}
+    return tuple((leaf.key, values[leaf.key]) for leaf in config.leaves(given) if isinstance(leaf.value, Uniform))
 
 
 @dc.dataclass
@@ -102,36 +172,49 @@ def run(
     Raises ConfigError if the folder holds another campaign, or one that is under way; OperationFailed if the executor
     loses a trial, which then has no record and is run by the next call.
     """
-    trials = campaign.trials()
+    campaign.check()
+    records: dict[str, Record] = {}
     with _claimed(campaign):
-        records = {trial.key: record for trial in trials if (record := read(campaign.out, trial)) is not None}
-        if records:
-            say(f"{len(records)} of {len(trials)} runs are there already")
-        progress = Progress(len(records), len(trials), sum(map(turned, records.values())))
-        left = iter([trial for trial in trials if trial.key not in records])
-        show(progress)
-        waiting: dict[concurrent.futures.Future[Record], Trial] = {}
-        try:
-            # As many as may wait at a time: a campaign that is broken off leaves little behind.
-            while True:
-                for trial in left:
-                    waiting[executor.submit(perform, trial)] = trial
-                    if len(waiting) >= 256:
-                        break
-                if not waiting:
-                    break
-                done, _ = concurrent.futures.wait(waiting, return_when=concurrent.futures.FIRST_COMPLETED)
-                for future in done:
-                    trial = waiting.pop(future)
-                    record = finished(campaign, trial, _made(future, trial))
-                    records[trial.key] = record
-                    progress = Progress(progress.done + 1, progress.total, progress.turned + turned(record))
+        progress = Progress(0, campaign.total, 0)
+        for trials in campaign.batches(records):
+            there = {trial.key: record for trial in trials if (record := read(campaign.out, trial)) is not None}
+            records |= there
+            if there:
+                say(f"{len(there)} of {len(trials)} runs are there already")
+            progress.done += len(there)
+            progress.turned += sum(map(turned, there.values()))
+            show(progress)
+            left = [trial for trial in trials if trial.key not in records]
+            with contextlib.closing(_performed(left, executor)) as ended:
+                for trial, record in ended:
+                    records[trial.key] = finished(campaign, trial, record)
+                    progress.done += 1
+                    progress.turned += turned(record)
                     show(progress)
-        except BaseException:
-            for future in waiting:
-                future.cancel()
-            raise
-    return [records[trial.key] for trial in trials]
+            for trial in trials:  # in the order of the trials
+                records[trial.key] = records.pop(trial.key)
+    return list(records.values())
+
+
+def _performed(
+    trials: Sequence[Trial], executor: concurrent.futures.Executor
+) -> Generator[tuple[Trial, Record], None, None]:
+    """Each trial and its record, as they end; MANY wait at a time: what is broken off leaves little behind."""
+    left = iter(trials)
+    waiting: dict[concurrent.futures.Future[Record], Trial] = {}
+    try:
+        while True:
+            for trial in itertools.islice(left, MANY - len(waiting)):
+                waiting[executor.submit(perform, trial)] = trial
+            if not waiting:
+                break
+            done, _ = concurrent.futures.wait(waiting, return_when=concurrent.futures.FIRST_COMPLETED)
+            for future in done:
+                trial = waiting.pop(future)
+                yield trial, _made(future, trial)
+    finally:
+        for future in waiting:
+            future.cancel()
 
 
 def _made(future: "concurrent.futures.Future[Record]", trial: Trial) -> Record:
@@ -165,7 +248,7 @@ def read(out: Path, trial: Trial) -> Record | None:
     if not path.exists():
         return None
     record = _load(path)
-    if (record["scenario"], record["seed"]) != (trial.name, trial.seed):
+    if (record["scenario"], record["seed"], record.get("draws")) != (trial.name, trial.seed, dict(trial.draws)):
         raise ConfigError(f"{path}: not the record of {trial.key}; remove it, and the trial is run again")
     return record
 
@@ -204,9 +287,10 @@ def _claimed(campaign: Campaign) -> Iterator[None]:
     out = campaign.out
     wanted = {
         "scenarios": {
-            name_of(path): scenario.dump(scenario.load(path, campaign.overrides)) for path in campaign.scenarios
+            name: scenario.dump(scenario.load(path, overrides)) for name, (path, overrides) in campaign.named.items()
         },
         "first_seed": campaign.first_seed,
+        "hunt": campaign.hunt,
         "overrides": list(campaign.overrides),
         "versions": versions(),
     }
@@ -231,11 +315,10 @@ def _claimed(campaign: Campaign) -> Iterator[None]:
 
 def _same(there: dict[str, Any], wanted: dict[str, Any], out: Path) -> None:
     """Refuses to go on with another campaign: its records would be mixed with this one's."""
-    for key in ("scenarios", "first_seed", "overrides"):
+    for key in ("scenarios", "first_seed", "overrides", "hunt"):
         if there.get(key) != wanted[key]:
-            raise ConfigError(
-                f"--out {str(out)!r} holds a campaign of other {key.replace('_', ' ')}: choose another folder"
-            )
+            other = "draws (--hunt)" if key == "hunt" else key.replace("_", " ")
+            raise ConfigError(f"--out {str(out)!r} holds a campaign of other {other}: choose another folder")
     changed = [k for k, v in wanted["versions"].items() if there["versions"].get(k) != v]
     if changed:
         words = ", ".join(f"{k} {there['versions'].get(k)} -> {wanted['versions'][k]}" for k in changed)

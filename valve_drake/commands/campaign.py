@@ -17,7 +17,7 @@ from valve_drake.console import console as make_console
 if TYPE_CHECKING:
     from valve_drake.campaign.campaign import Progress
 
-REPORT, TABLE = "report.html", "runs.csv"
+REPORT, TABLE, FAILURES = "report.html", "runs.csv", "failures.yaml"
 
 
 def add(commands: Subcommands) -> None:
@@ -27,9 +27,11 @@ def add(commands: Subcommands) -> None:
         nargs="*",
         help="files, or names in diagrams/ (default: simulated.scenario.yaml); or: compare A B, two campaigns' folders",
     )
-    p.add_argument("--runs", type=int, default=20, help="of each scenario (default: 20)")
+    p.add_argument("--runs", type=int, metavar="N", help="of each scenario (default: 20; of --again: its whole list)")
     p.add_argument("--first-seed", type=int, default=1, metavar="S", help="seeds S, S+1, ... (default: 1)")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="overrides any key of the scenarios")
+    p.add_argument("--hunt", action="store_true", help="choose what is drawn where runs fail or nearly do")
+    p.add_argument("--again", type=Path, metavar="FILE", help="run the failures of a list (failures.yaml) again")
     p.add_argument("--jobs", type=int, default=1, help="runs at a time (default: 1)")
     p.add_argument("--out", type=Path, metavar="FOLDER", help="of the records (default: logs/campaign-<scenario>-<S>)")
     p.add_argument("--backend", choices=("local", "dask"), default="local", help="where the runs are made")
@@ -50,28 +52,48 @@ def command(options: argparse.Namespace) -> int:
         return compare(options)
     check_rendering()
     from valve_drake.campaign import campaign as campaigns
-    from valve_drake.campaign import report
+    from valve_drake.campaign import failures, report
     from valve_drake.campaign.executors import executor
     from valve_drake.scenario import DEFAULT
 
-    given = tuple(options.scenario) or (DEFAULT,)
-    out = options.out or Path("logs") / f"campaign-{campaigns.name_of(given[0])}-{options.first_seed}"
-    wanted = campaigns.Campaign(
-        given, options.runs, options.first_seed, tuple(options.set), out, options.logs, options.time_out
-    )
     if not options.time_out > 0:
         raise ConfigError(f"--time-out must be above 0 s, got {options.time_out}")
-    wanted.trials()  # what is wrong is said before anything is begun
+    given = tuple(options.scenario) or (DEFAULT,)
+    kind, runs = ("hunt" if options.hunt else "campaign"), options.runs
+    again: tuple[failures.Failure, ...] = ()
+    if options.again is not None:
+        if options.hunt or options.scenario:
+            raise ConfigError("--again goes with no scenario and no --hunt: its list names them")
+        if runs is not None and runs < 1:
+            raise ConfigError(f"--runs must be 1 or more, got {runs}")
+        again = failures.read(options.again)[:runs]
+        kind, given, runs = "again", (str(options.again),), 1
+    out = options.out or Path("logs") / f"{kind}-{campaigns.name_of(given[0])}-{options.first_seed}"
+    wanted = campaigns.Campaign(
+        given,
+        20 if runs is None else runs,
+        options.first_seed,
+        tuple(options.set),
+        out,
+        options.logs,
+        options.time_out,
+        options.hunt,
+        again,
+    )
+    wanted.check()  # what is wrong is said before anything is begun
     with _display(not options.json) as show, executor(options.backend, options.jobs, options.scheduler) as pool:
         records = campaigns.run(wanted, pool, show, complain)
     outputs.write(out / TABLE, report.table(records))
     outputs.write(out / REPORT, report.page(records, out))
+    failures.write(out / FAILURES, campaigns.failures(records))
     numbers = campaigns.summary(records)
     if options.json:
         print(json.dumps(numbers))
     else:
         _print(numbers)
-        say(f"report {out / REPORT}, table {out / TABLE}")
+        say(f"report {out / REPORT}, table {out / TABLE}, failures {out / FAILURES}")
+    if options.hunt:
+        return OK  # to find failures is what it is for
     return OK if numbers["turned"] == numbers["runs"] else FAILED
 
 
