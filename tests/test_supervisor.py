@@ -266,7 +266,7 @@ def test_elsewhere_valve_search_has_no_say(mode):
 # ---------------------------------------------------------------- verdicts
 
 
-@pytest.mark.parametrize("verdict", ["stuck", "end_stop", "slip", "reach_limit"])
+@pytest.mark.parametrize("verdict", ["stuck", "end_stop", "slip"])
 def test_a_turn_that_fails_lets_go_looks_backs_off_and_keeps_its_verdict(verdict):
     bench = bring_to(Mode.TURN)
     seen = {
@@ -276,6 +276,46 @@ def test_a_turn_that_fails_lets_go_looks_backs_off_and_keeps_its_verdict(verdict
     state = bench.until_end(lambda s: {OWNER[s.mode]: seen.get(s.mode, {"state": "succeeded"})})
     assert bench.modes[-5:] == [Mode.RELEASE, Mode.FOLD, Mode.VERIFY, Mode.RETREAT, Mode.FAILED]
     assert (state.verdict, state.reason) == (verdict, "hybrid_rotation: 12 N m")
+
+
+def test_a_turn_longer_than_one_grasp_reaches_goes_back_to_measure_until_the_camera_has_seen_it():
+    bench, left = bring_to(Mode.TURN), [3]
+
+    def each(s):
+        if s.mode != Mode.VERIFY or left[0] == 0:
+            return {OWNER[s.mode]: {"state": "succeeded"}}
+        left[0] -= s.mode == Mode.VERIFY
+        return {OWNER[s.mode]: {"state": "failed", "verdict": "reach_limit", "cause": "regrasp"}}
+
+    state = bench.until_end(each)
+    once = [Mode.RELEASE, Mode.FOLD, Mode.VERIFY]
+    again = [*once, Mode.MEASURE, Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN]
+    assert bench.modes[-len(again) * 3 - 5 :] == [*again * 3, *once, Mode.RETREAT, Mode.DONE]
+    assert (state.mode, state.verdict) == (Mode.DONE, Verdict.TURNED)
+
+
+def test_arms_at_their_limit_in_a_turn_let_go_and_take_hold_again():
+    bench = bring_to(Mode.TURN)
+    bench.tick(lambda s: {OWNER[s.mode]: {"state": "failed", "verdict": "reach_limit"}})
+    assert (bench.state.mode, bench.state.verdict) == (Mode.RELEASE, Verdict.NONE)
+    bench.tick(lambda s: {OWNER[s.mode]: {"state": "succeeded"}})
+    assert bench.state.mode == Mode.FOLD
+
+
+def test_a_run_that_fails_takes_no_other_grasp():
+    bench = bring_to(Mode.TURN)
+    seen = {
+        Mode.TURN: {"state": "failed", "verdict": "end_stop", "detail": "at 60 deg"},
+        Mode.VERIFY: {"state": "failed", "verdict": "reach_limit", "cause": "regrasp"},
+    }
+    state = bench.until_end(lambda s: {OWNER[s.mode]: seen.get(s.mode, {"state": "succeeded"})})
+    assert bench.modes[-2:] == [Mode.RETREAT, Mode.FAILED] and state.verdict == "end_stop"
+
+
+@pytest.mark.parametrize("opening, request_, sign", [(1.0, "open", 1), (-1.0, "open", -1), (-1.0, "close", 1)])
+def test_the_sense_that_opens_is_the_valves(opening, request_, sign):
+    state = step(CONFIG, State(), 1.0, {}, Health(time=1.0), OperatorCommand(1, request_, 0.5), None, opening)
+    assert state.turn_angle == sign * 0.5
 
 
 def test_a_reach_that_fails_folds_the_arms_and_backs_off_though_nothing_was_turned():

@@ -305,7 +305,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
         ImageServoSystem(ImageServo(scenario.image_servo, robot, taught)),
         HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, valve, robot, view)),
         CommandSelectorSystem(scenario.command_selector, initial_commands(scenario), robot.torso, robot.arms),
-        SupervisorSystem(scenario.supervisor),
+        SupervisorSystem(scenario.supervisor, opening=valve.sense),
         *(
             [OperatorChannelSystem(scenario.operator_channel, scenario.angle, scenario.supervisor.angle_limit)]
             if listens(scenario)

@@ -306,6 +306,7 @@ class Cause(enum.StrEnum):
 
     NONE = ""
     STANCE = "stance"  # the arms would reach from another place
+    REGRASP = "regrasp"  # the hands turned the valve as far as one grasp reaches, and more is asked for
 
 
 class Verdict(enum.StrEnum):
@@ -475,7 +476,8 @@ class GraspPlan(Message):
     covariance: np.ndarray = array(6, 6)  # of the marker's pose in B, as in RectangleEstimate with L replaced by B
     handle_left: int = 0  # which of the valve's handles the hands take
     handle_right: int = 1
-    turn: float = 0.0  # how far these grasps turn the valve, at most what was asked for, signed [rad]
+    turned: float = 0.0  # by the valve in this run before these grasps, as the camera saw it [rad]
+    turn: float = 0.0  # how far these grasps turn it, at most what was asked for [rad]
     X_BG_left: np.ndarray = transform()  # grasps
     X_BG_right: np.ndarray = transform()
     q_standoff: np.ndarray = array(-1)  # both arms at the stand-offs before the grasps, left first [rad]
@@ -504,7 +506,7 @@ class TurnState(Message):
     time: float = 0.0
     number: int = -1  # of the GraspPlan that the hands follow
     stage: str = ""
-    angle: float = 0.0  # turned since the grasp, by the line between the hands [rad]
+    angle: float = 0.0  # turned in this run: the plan's `turned`, and since by the line between the hands [rad]
     angle_reference: float = 0.0
     rate: float = 0.0  # [rad/s]
     torque: float = 0.0  # that the hands put on the valve about u [N m]

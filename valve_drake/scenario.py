@@ -6,8 +6,10 @@ own name, so that a new key changes no other number. `valve-drake scenario` prin
 """
 
 import dataclasses as dc
+import re
 import typing
 import zlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,6 +38,7 @@ from valve_drake.supervisor.supervisor import SupervisorConfig
 from valve_drake.valve.valve import Valve
 
 DEFAULT = "simulated.scenario.yaml"
+LEVELS, ENDING = "levels", ".scenario.yaml"  # in diagrams/; of scenarios' files
 # Keys of older versions: a log that has them can still be replayed.
 RETIRED = (
     "base_approach.panel_behind",
@@ -122,10 +125,32 @@ def former_names() -> dict[str, str]:
 def load(path: str | None = None, overrides: typing.Sequence[str] = ()) -> Scenario:
     """The scenario of a file (a path, or a name in diagrams/; None: the default one) with `key=value` overrides.
 
-    Raises ConfigError: no such file, not YAML, unknown key, wrong type, value out of range.
+    A name needs neither its folder `levels` nor its ending. A file that begins `like: FILE` states only what differs
+    from that one. Raises ConfigError: no such file, not YAML, unknown key, wrong type, value out of range.
     """
-    file = resources.find(path or DEFAULT, resources.diagrams())
-    return with_overrides(parse(yaml_file.read_text(file, file.name), file.name), overrides)
+    return with_overrides(_load(path or DEFAULT, 0), overrides)
+
+
+def _load(name: str, depth: int) -> Scenario:
+    file = _find(name)
+    given = yaml_file.parse(yaml_file.read_text(file, file.name), file.name, TAGS)
+    base = Scenario()
+    if isinstance(given, dict) and "like" in given:
+        like = given.pop("like")
+        if not isinstance(like, str) or depth == 3:
+            raise ConfigError(f"{file.name}: like must be the name of a scenario, at most 3 deep, got {shown(like)}")
+        base = _load(like, depth + 1)
+    return config.build(base, {} if given is None else given, file.name)
+
+
+def _find(name: str) -> Path:
+    """A path as it is; a plain name may lack its folder or ending. Raises ConfigError."""
+    folder = resources.diagrams()
+    if re.fullmatch(r"[\w.-]{1,80}", name, re.ASCII) and not Path(name).is_file():
+        for inner in (folder / f"{name}{ENDING}", folder / LEVELS / name, folder / LEVELS / f"{name}{ENDING}"):
+            if inner.is_file():
+                return inner
+    return resources.find(name, folder)
 
 
 def with_overrides(scenario: Scenario, overrides: typing.Sequence[str]) -> Scenario:

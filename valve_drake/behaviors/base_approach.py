@@ -41,9 +41,10 @@ from valve_drake.messages import (
 )
 from valve_drake.motion import slew, towards
 from valve_drake.task.modes import owned
-from valve_drake.valve.valve import Valve, heading
+from valve_drake.valve.valve import Valve, has_heading
 
 MODES = owned("base_approach")
+SLIM = 0.15  # so much nearer to an upright axis than to a panel may the base come; lower it for a wide post [m]
 RAISED = 0.01  # lift and waist are at the stance's when they are off by less [m, rad]
 
 
@@ -280,6 +281,8 @@ def _fine(
             return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
         return changed(m, detail="waiting for a stance"), np.zeros(2)
     goal, panel = m.stance.median, m.panel.median
+    if np.isnan(panel[2]):  # an upright axis: a plane behind its post, facing the stance
+        panel = np.array([*_ahead(np.array([*panel[:2], goal[2]]), SLIM), goal[2]])
     room = -_offset(goal, panel).s - config.clearance
     if room < 0:
         return _end(m, "failed", Verdict.REACH_LIMIT, f"the stance is {-room:.3f} m too near to the panel")
@@ -308,10 +311,11 @@ def _ahead(pose: np.ndarray, distance: float) -> np.ndarray:
 def _panel(valve: Valve, estimate: RectangleEstimate) -> np.ndarray:
     """The stem at the panel and the heading of the panel's normal into it, on the floor -> (3,).
 
-    Before a valve whose axis is upright it is an upright plane through the axis, facing the robot.
+    A valve whose axis is upright has no such heading: not a number.
     """
     X_OA = compose(estimate.X_OL, estimate.X_LV, valve.X_VA())
-    return np.array([*compose(X_OA, valve.X_AP())[:2, 3], heading(X_OA, estimate.X_OL[:2, 3])])
+    upright = not has_heading(X_OA)
+    return np.array([*compose(X_OA, valve.X_AP())[:2, 3], np.nan if upright else np.arctan2(X_OA[1, 2], X_OA[0, 2])])
 
 
 def _pre_stance(config: BaseApproachConfig, goal: np.ndarray) -> np.ndarray:

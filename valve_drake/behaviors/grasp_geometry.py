@@ -16,7 +16,7 @@ from valve_drake.config import Config, number
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.robot.kinematics import RobotKinematics, seeds
-from valve_drake.valve.valve import Valve, heading, turned
+from valve_drake.valve.valve import Valve, has_heading, heading, turned
 
 MAX_PLACES = 40  # distances of one search for a stance: it must end while the robot waits
 
@@ -89,6 +89,7 @@ class Arc:
 OTHERS = 4  # postures that a redundant arm's way begins from, beside the first
 JUMP = 1.0  # a joint that moves so far between two angles of the turn is on another branch [rad]
 ONE_GRASP = 2.3  # a longer turn is not tried with one grasp alone [rad]
+AROUND = (0.5, -0.5, 1.0, -1.0)  # sides from which a valve with an upright axis is tried, off the nearest [rad]
 CROSSED = 0.02  # the left hand is to the right of the right one by more than this [m]
 PAIRS = 6  # of handles, at most, that are tried of each kind
 
@@ -348,17 +349,19 @@ class Stances:
         then a step aside."""
         c = self.config
         angle = heading(X_OA, viewer)
-        forward, left = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        left = np.array([-np.sin(angle), np.cos(angle)])
         stem = compose(X_OA, self.valve.X_AP())[:2, 3]  # at the panel
         distances = np.arange(c.distance_min, c.distance_max + 1e-9, c.distance_step)
-        bases = [np.array([*(stem - distance * forward), angle]) for distance in distances]
+        bases = [_before(stem, distance, angle) for distance in distances]
         home = self.robot.posture.home
         groups = [tuple(Place(base) for base in bases)]
         if posture is not None and np.max(np.abs(posture - home), initial=0.0) > 1e-3:
             groups.insert(0, tuple(Place(base, posture) for base in bases))
         if raised := self._postures():
             groups.append(tuple(Place(base, posture) for posture in raised for base in bases))
-        if c.aside > 0:
+        if not has_heading(X_OA):  # a valve that lies flat is turned from any side
+            groups += [tuple(Place(_before(stem, d, angle + off)) for d in distances) for off in AROUND]
+        elif c.aside > 0:
             steps = [np.array([*(side * c.aside * left), 0.0]) for side in (1.0, -1.0)]
             groups.append(tuple(Place(base + step) for step in steps for base in bases[::2]))
         return tuple(groups)
@@ -404,6 +407,11 @@ class Stances:
         while not search.done:
             search = self.advance(search)
         return search.best or Place(np.zeros(3)), search.margin
+
+
+def _before(stem: np.ndarray, distance: float, angle: float) -> np.ndarray:
+    """The base so far before the stem (x, y), facing it -> x, y, heading."""
+    return np.array([stem[0] - distance * np.cos(angle), stem[1] - distance * np.sin(angle), angle])
 
 
 def _better(arc: Arc, best: Arc, whole: bool) -> bool:

@@ -273,7 +273,9 @@ class HybridRotation:
         left = sense * (goal - m.turned)
         if m.stage == "turn" and left <= c.tolerance:
             detail = f"{np.degrees(m.turned):.2f} deg by the hands"
-            status = Status(time, m.activation, "succeeded", detail=detail, progress=1.0, value=m.turned)
+            status = Status(
+                time, m.activation, "succeeded", detail=detail, progress=1.0, value=m.plan.turned + m.turned
+            )
             m = changed(m, stage="there", status=status)
             return m, twists(chain, None, c, np.zeros(6)), gripper
         lead = sense * (m.commanded - m.turned)
@@ -282,8 +284,8 @@ class HybridRotation:
             rate = min(rate, max(m.rate - c.rate / c.ramp * dt, 0.0))
             m = changed(m, progress_at=(time, m.turned))
         m = changed(m, rate=rate, commanded=m.commanded + sense * rate * dt)
-        progress = min(max(m.turned / asked, 0.0), 1.0)
-        m = changed(m, status=Status(time, m.activation, "running", progress=progress, value=m.turned))
+        progress = min(max((m.plan.turned + m.turned) / mode.turn_angle, 0.0), 1.0)
+        m = changed(m, status=Status(time, m.activation, "running", progress=progress, value=m.plan.turned + m.turned))
         m = self._stall(time, m, sense, left)
         return m, twists(chain, sense * rate, c, np.zeros(6)), gripper
 
@@ -360,13 +362,13 @@ class HybridRotation:
             left, right = (standoff(m.start[k], self.view[side], way) for k, side in enumerate(SIDES))
             m = self._command(m, (left, right), state.posture)
             if way >= c.retreat:
-                status = Status(time, m.activation, "succeeded", progress=1.0, value=m.turned)
+                status = Status(time, m.activation, "succeeded", progress=1.0, value=m.plan.turned + m.turned)
                 m = changed(m, stage="away", status=status)
         return m, np.zeros((2, 6)), opened
 
     # ------------------------------------------------------------ common
     def _fail(self, time: float, m: Memory, verdict: Verdict, detail: str) -> Memory:
-        status = Status(time, m.activation, "failed", verdict, detail, value=m.turned)
+        status = Status(time, m.activation, "failed", verdict, detail, value=m.plan.turned + m.turned)
         return changed(m, stage="failed", status=status)
 
     def _move(self, dt: float, m: Memory, V: np.ndarray, chain: Chain, posture: np.ndarray) -> Memory:
@@ -393,8 +395,8 @@ class HybridRotation:
             time=time,
             number=m.plan.number,
             stage=m.stage,
-            angle=m.turned,
-            angle_reference=m.commanded,
+            angle=m.plan.turned + m.turned,
+            angle_reference=m.plan.turned + m.commanded,
             rate=m.rate,
             torque=chain.torque,
             share_left=float(couples[0] / chain.torque) if abs(chain.torque) > 0.5 else chain.share,

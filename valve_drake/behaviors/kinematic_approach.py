@@ -89,7 +89,9 @@ class Memory:
     seen: int = -1  # sequence of the newest estimate used
     covariance: np.ndarray = dc.field(default_factory=lambda: np.zeros((6, 6)))  # of the valve that was measured
     request: PlanRequest = PlanRequest()  # the last one
-    X_OA0: np.ndarray | None = None  # the valve before the turn
+    X_OA0: np.ndarray | None = None  # the valve before this run turned it
+    X_OA: np.ndarray | None = None  # the valve as it was measured last
+    counted: float = 0.0  # turned in this run until then, by the camera [rad]
     plan: GraspPlan = GraspPlan()
     status: Status = Status()
 
@@ -109,6 +111,7 @@ class Inputs(NamedTuple):
 # Modes in which another block moves the arms; on return the commands start from the measured joints.
 NOT_OWNED = tuple(mode for mode, row in TABLE.items() if row.hands != "kinematic_approach")
 STILL = 0.005  # lift and waist have not moved by more in the last second: they stand [rad, m]
+AGREE = 0.1  # camera and hands, on a turn in which nothing slipped [rad]
 NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms [m]
 
 
@@ -141,6 +144,8 @@ class KinematicApproach:
             m = changed(m, status=Status(time=time, activation=mode.activation, state="idle"))
         if mine_again or mode.mode in NOT_OWNED:
             m = changed(m, q=measured, path=None)
+        if mode.mode == Mode.IDLE and m.X_OA0 is not None:
+            m = changed(m, X_OA0=None)  # a new run counts from its own beginning
         if mode.mode in NOT_OWNED:
             return m, Command(time=time)
         run = {
@@ -169,10 +174,15 @@ class KinematicApproach:
 
     def _valve(self, m: Memory, state: RobotState, turn: TurnState) -> np.ndarray | None:
         """X_BA of the valve that was measured last, turned as the hands left it; None if there is none near."""
-        if m.X_OA0 is None:
+        if m.X_OA is None:
             return None
-        X_BA = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OA0, turn.angle))
+        since = self._by_hands(m, turn) - m.counted
+        X_BA = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OA, since))
         return X_BA if np.hypot(*X_BA[:2, 3]) < NEAR else None
+
+    def _by_hands(self, m: Memory, turn: TurnState) -> float:
+        """How far the valve was turned in this run: by the camera until the last plan, and since by the hands [rad]."""
+        return turn.angle if turn.number == m.plan.number >= 0 else m.counted
 
     def _homing(self, time: float, m: Memory, X_BA: np.ndarray | None, inputs: Inputs) -> Memory:
         """Brings the arms home along a free path, once per activation; m.path is the move, phase "home" on arrival.
@@ -232,8 +242,13 @@ class KinematicApproach:
             return m  # lift or waist is on its way
         X_OA = compose(fused.X_OV, self._X_VA)
         X_BA = compose(inverse(planar(*inputs.state.odometry[:3])), X_OA)
-        m = changed(m, phase="planning", X_OA0=X_OA, covariance=fused.covariance)
-        return self._ask(m, "grasps", X_BA, posture=inputs.state.posture, turn_angle=inputs.mode.turn_angle)
+        counted = 0.0
+        if m.X_OA0 is not None:
+            counted = self.seen_angle(m.X_OA0, X_OA, fused.axis_known, self._by_hands(m, inputs.turn))
+        first = X_OA if m.X_OA0 is None else m.X_OA0
+        m = changed(m, phase="planning", X_OA0=first, X_OA=X_OA, counted=counted, covariance=fused.covariance)
+        m = changed(m, plan=GraspPlan())  # what the hands did by it is counted
+        return self._ask(m, "grasps", X_BA, posture=inputs.state.posture, turn_angle=inputs.mode.turn_angle - counted)
 
     def _plan(self, time: float, m: Memory, grasps: GraspPlan) -> Memory:
         """Takes the grasps that were asked for."""
@@ -245,7 +260,7 @@ class KinematicApproach:
             return self._status(m, time, "failed", Verdict.REACH_LIMIT, detail, cause=Cause.STANCE)
         p = grasps.X_BA[:, 3]
         detail = f"valve {np.hypot(p[0], p[1]):.3f} m ahead, {p[2]:.3f} m high, margin {grasps.margin:.2f}"
-        m = changed(m, plan=dc.replace(grasps, time=time, covariance=m.covariance))
+        m = changed(m, plan=dc.replace(grasps, time=time, covariance=m.covariance, turned=m.counted))
         return self._status(m, time, "succeeded", detail=detail)
 
     # ------------------------------------------------------------ reach
@@ -301,12 +316,19 @@ class KinematicApproach:
         m = changed(m, phase="end")
         if not fused.found or m.X_OA0 is None:
             return self._status(m, time, "failed", Verdict.MARKER_LOST, fused.reason)
-        seen = self.seen_angle(m.X_OA0, compose(fused.X_OV, self._X_VA), fused.axis_known, inputs.turn.angle)
-        missing = abs(inputs.mode.turn_angle - seen)
-        detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(inputs.mode.turn_angle):.2f} deg"
-        state_now = "succeeded" if missing <= self.config.angle_tolerance else "failed"
-        verdict = Verdict.NONE if state_now == "succeeded" else Verdict.SLIP
-        return changed(m, status=self._seen(time, m, state_now, verdict, detail, seen))
+        seen = self.seen_angle(
+            m.X_OA0, compose(fused.X_OV, self._X_VA), fused.axis_known, self._by_hands(m, inputs.turn)
+        )
+        asked, tolerance = inputs.mode.turn_angle, self.config.angle_tolerance
+        detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(asked):.2f} deg"
+        if abs(asked - seen) <= tolerance:
+            return changed(m, status=self._seen(time, m, "succeeded", Verdict.NONE, detail, seen))
+        hands = self._by_hands(m, inputs.turn)
+        if not inputs.mode.verdict and abs(asked - hands) > tolerance and abs(hands - seen) < AGREE:
+            # The turn ended as it should, where the arms reach no farther.
+            status = self._seen(time, m, "failed", Verdict.REACH_LIMIT, detail, seen)
+            return changed(m, status=dc.replace(status, cause=Cause.REGRASP.value))
+        return changed(m, status=self._seen(time, m, "failed", Verdict.SLIP, detail, seen))
 
     def _drift(self, looks: tuple[RectangleEstimate, ...]) -> float | None:
         """How fast the valve turns, by the slope of its angle over the looks [rad/s]; None: too few of them to tell.
@@ -326,13 +348,13 @@ class KinematicApproach:
 
     def _unverified(self, m: Memory, time: float, mode: ModeState, turn: TurnState, drift: float | None) -> Memory:
         """The camera cannot say how far the valve is turned: what the hands felt is told, and not taken for it."""
-        asked, felt = np.degrees(mode.turn_angle), np.degrees(turn.angle)
+        asked, felt = np.degrees(mode.turn_angle), np.degrees(self._by_hands(m, turn))
         hands = f"hands turned {felt:.2f} deg of {asked:.2f} deg"
         m = changed(m, phase="end")
         if drift is None or m.X_OA0 is None:
             return self._status(m, time, "failed", Verdict.UNVERIFIED, f"camera does not see the marker, {hands}")
         fused = fuse(m.looks[-1:])
-        seen = self.seen_angle(m.X_OA0, compose(fused.X_OV, self._X_VA), fused.axis_known, turn.angle)
+        seen = self.seen_angle(m.X_OA0, compose(fused.X_OV, self._X_VA), fused.axis_known, self._by_hands(m, turn))
         camera = f"camera sees {np.degrees(seen):.2f} deg, turning by {np.degrees(drift):+.2f} deg/s"
         status = self._seen(time, m, "failed", Verdict.UNVERIFIED, f"{camera}, {hands}", seen)
         return changed(m, status=status)

@@ -64,7 +64,7 @@ class RobotFrames:
             X_OA = compose(estimate.X_OL, estimate.X_LV, self._X_VA)
         else:
             return out
-        X_now = turned(X_OA, turn.angle) if plan.found else X_OA
+        X_now = turned(X_OA, turn.angle - plan.turned) if plan.found and turn.number == plan.number else X_OA
         return out + [
             (ODOMETRY, "marker", compose(X_now, self._X_AV)),
             ("marker", "valve::wheel", self._X_VWheel),

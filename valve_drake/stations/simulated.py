@@ -145,7 +145,7 @@ class TruthSystem(PythonSystem):
     -----------  ---  ----------  ---------------------------------------------------------------------
     state        in   vector      of the whole plant
     stem_load    in   vector(6)   of the plant
-    valve_angle  out  vector(2)   opened since closed [rad], and its rate [rad/s]
+    valve_angle  out  vector(2)   turned since closed, counter-clockwise [rad], and its rate [rad/s]
     base_pose    out  vector(3)   x, y, heading in W
     marker_pose  out  vector(12)  X_WV, rows of (3, 4)
     stem_wrench  out  vector(6)   on the valve from its bearing, in the stem's frame, in the last step
@@ -153,7 +153,7 @@ class TruthSystem(PythonSystem):
 
     OUTPUTS = {"valve_angle": 2, "base_pose": 3, "marker_pose": 12, "stem_wrench": 6}
 
-    def __init__(self, physics: PlantSystem, valve: ValveConfig, sense: float):
+    def __init__(self, physics: PlantSystem, valve: ValveConfig):
         super().__init__()
         self.set_name("truth")
         plant = physics.plant
@@ -162,7 +162,7 @@ class TruthSystem(PythonSystem):
         stem = plant.GetJointByName("stem", physics.valve)
         self._q, self._v = stem.position_start(), plant.num_positions() + stem.velocity_start()
         self._base = [plant.GetJointByName(j, physics.robot).position_start() for j in physics.base]
-        self._bar_angle, self._sense = valve.bar_angle, sense
+        self._bar_angle = valve.bar_angle
         self._X_WP = panel_pose(valve)
         X = marker_frame(plant, physics.valve).GetFixedPoseInBodyFrame()
         self._X_LinkMarker = make(X.rotation().matrix(), X.translation())
@@ -173,8 +173,7 @@ class TruthSystem(PythonSystem):
 
     def _calc_valve_angle(self, context: Context, output: BasicVector) -> None:
         state = self._state.Eval(context)
-        sense = self._sense
-        output.SetFromVector([sense * (state[self._q] - self._bar_angle), sense * state[self._v]])
+        output.SetFromVector([state[self._q] - self._bar_angle, state[self._v]])
 
     def _calc_base_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._state.Eval(context)[self._base])
@@ -361,7 +360,7 @@ def make_simulated_station(
     health = builder.AddSystem(HealthSystem())
     builder.ExportOutput(health.GetOutputPort("health"), "health")
 
-    truth = builder.AddSystem(TruthSystem(physics, valve, shape.sense))
+    truth = builder.AddSystem(TruthSystem(physics, valve))
     builder.Connect(part["state"], truth.GetInputPort("state"))
     builder.Connect(part[STEM], truth.GetInputPort("stem_load"))
     for name in TruthSystem.OUTPUTS:

@@ -58,7 +58,7 @@ class SupervisorConfig(Config):
     run_deadline: float = number(
         160.0, 1.0, 3600.0, "from the operator's command until the run gives up; a good one takes 60 s [s]"
     )
-    retries: dict[str, int] = table(RETRIES, 0, 10, "in a run, by what failed", tuple(RETRIES), complete=True)
+    retries: dict[str, int] = table(RETRIES, 0, 20, "in a run, by what failed", tuple(RETRIES), complete=True)
     head_every: dict[str, int] = table(
         HEAD_EVERY, 0, 1000, "in each mode: perception looks at every n-th pair of the head's images, 0: at none", MODES
     )
@@ -131,8 +131,11 @@ def step(
     health: Health | None,
     operator: OperatorCommand | None,
     selector: SelectorReport | None,
+    opening: float = 1.0,
 ) -> State:
-    """One step -> new state. statuses: block name -> Status; None: that port is open."""
+    """One step -> new state. statuses: block name -> Status; None: that port is open.
+
+    opening: 1 if the valve opens counter-clockwise, -1 if clockwise."""
     s = state
     request = ""
     if operator is not None and operator.sequence != s.sequence:
@@ -144,7 +147,9 @@ def step(
         return _abort(s, time, Mode.STOPPED, Verdict.STOPPED, "stopped by the operator")
     fault = find_fault(config, time, health, selector)
     if s.mode == Mode.IDLE:
-        return _begin(config, s, time, request, operator.angle, fault) if operator is not None and request else s
+        if operator is None or not request:
+            return s
+        return _begin(config, s, time, request, operator.angle, fault, opening)
     if fault and not _aborting(s):
         return _abort(s, time, Mode.FAILED, Verdict.FAULT, fault)
     if s.mode in HOLDS:
@@ -236,14 +241,16 @@ def _reset(s: State, time: float) -> State:
     return changed(idle, sequence=s.sequence, near=s.near)
 
 
-def _begin(config: SupervisorConfig, s: State, time: float, request: str, angle: float, fault: str) -> State:
+def _begin(
+    config: SupervisorConfig, s: State, time: float, request: str, angle: float, fault: str, opening: float
+) -> State:
     if request not in ("open", "close"):
         return s
     if not 0 < angle <= config.angle_limit:
         return changed(s, reason=f"refused: angle must be within (0, {config.angle_limit:g}] rad, got {angle}")
     if fault:
         return _enter(s, time, Mode.FAILED, fault, verdict=Verdict.FAULT)
-    sign = 1.0 if request == "open" else -1.0
+    sign = opening if request == "open" else -opening
     first = Mode.FOLD if s.near else Mode.SEARCH
     return _enter(s, time, first, f"operator: {request}", turn_angle=sign * angle, began=time, clearing=s.near)
 
@@ -286,7 +293,7 @@ def _fail(config: SupervisorConfig, s: State, time: float, block: str, status: S
     verdict = Verdict(status.verdict) if status.verdict in FAILURES else Verdict.FAULT
     reason = f"{block}: {status.detail or verdict.value}"
     retry = TABLE[s.mode].retry_of(status.cause, verdict)
-    if retry is None or s.retried.count(retry.limit) >= config.retries[retry.limit]:
+    if retry is None or s.verdict or s.retried.count(retry.limit) >= config.retries[retry.limit]:
         return _give_up(s, time, verdict, reason)
     after = retry.after_release or Mode.FOLD
     return _enter(s, time, retry.mode, reason, retried=(*s.retried, retry.limit), after_release=after)

@@ -27,9 +27,10 @@ class SupervisorSystem(Block[SupervisorInputs, State]):
     INPUTS = dict.fromkeys(BEHAVIORS, Status())
     OUTPUTS = {"mode": ModeState}
 
-    def __init__(self, config: SupervisorConfig, name: str = "supervisor"):
+    def __init__(self, config: SupervisorConfig, name: str = "supervisor", *, opening: float = 1.0):
+        """opening: 1 if the valve opens counter-clockwise, -1 if clockwise."""
         config.check()
-        self.config = config
+        self.config, self._opening = config, opening
         super().__init__(name, period=1 / 32, slot=3)
 
     def initial(self) -> State:
@@ -37,5 +38,7 @@ class SupervisorSystem(Block[SupervisorInputs, State]):
 
     def step(self, time: float, inputs: SupervisorInputs, memory: State) -> tuple[State, Outputs]:
         statuses = {name: inputs[name] for name in BEHAVIORS}
-        state = step(self.config, memory, time, statuses, inputs.health, inputs.operator, inputs.selector)
+        state = step(
+            self.config, memory, time, statuses, inputs.health, inputs.operator, inputs.selector, self._opening
+        )
         return state, {"mode": state.message(time, self.config)}

@@ -5,6 +5,8 @@ is `document()`; a test keeps it current.
 
     idle -(open, close)-> search -> rough_approach -> fine_approach -> measure -> reach -> servo -> grasp -> turn
          -> release -> fold -> verify -> retreat -> done
+
+A turn that is longer than one grasp reaches goes back from verify to measure.
 """
 
 import dataclasses as dc
@@ -183,6 +185,7 @@ ROWS = (
         deadline=60.0,
         contact=True,
         head_every=16,
+        retry={Verdict.REACH_LIMIT: Retry("turn", 3, Mode.RELEASE, after_release=Mode.FOLD)},
         off=Mode.RELEASE,
     ),
     Row(
@@ -213,6 +216,7 @@ ROWS = (
         deadline=12.0,
         ending=True,
         head_every=2,
+        retry={Cause.REGRASP: Retry("regrasp", 12, Mode.MEASURE)},
         off=Mode.RETREAT,
     ),
     Row(

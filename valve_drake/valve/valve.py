@@ -173,10 +173,13 @@ def heading(X_OA: np.ndarray, viewer: np.ndarray) -> float:
 
     An axis that is nearly upright has none: then it is the direction from the viewer's place (x, y) to the valve.
     """
-    z = X_OA[:2, 2]
-    if math.hypot(*z) < _UPRIGHT:
-        z = X_OA[:2, 3] - viewer[:2]
+    z = X_OA[:2, 2] if has_heading(X_OA) else X_OA[:2, 3] - viewer[:2]
     return math.atan2(z[1], z[0])
+
+
+def has_heading(X_OA: np.ndarray) -> bool:
+    """Whether the axis is not nearly upright."""
+    return math.hypot(*X_OA[:2, 2]) >= _UPRIGHT
 
 
 def turned(X_BA: np.ndarray, angle: float) -> np.ndarray:
