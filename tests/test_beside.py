@@ -69,6 +69,26 @@ with Beside(where, 2, 3) as beside:
     assert run(code) == ["1", "2", "True", "3", "4", "True"]
 
 
+def test_where_waiting_takes_longer_than_the_work_it_is_done_here_for_a_while():
+    code = """
+import types
+from valve_drake import beside as module
+
+def wait(*arguments):
+    clock[0] += seconds
+    return os.read(*arguments)
+
+clock, module.REST = [0.0], 3
+with Beside(where, 2, 3) as beside:
+    module.time = types.SimpleNamespace(perf_counter=lambda: clock[0])
+    module.os = types.SimpleNamespace(**vars(os) | {"read": wait})
+    for seconds in (0.0, 0.05, 0.0, 0.0, 0.0, 0.0):
+        beside.begin(one)
+        print("here" if beside.answer(one)[2] == here else "copy")
+"""
+    assert run(code) == ["copy", "copy", "here", "here", "here", "copy"]
+
+
 def test_beside_other_threads_no_copy_is_made():
     code = """
 import threading

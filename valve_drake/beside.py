@@ -18,6 +18,8 @@ from valve_drake import profiling
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # that the program answers in its own way
 _DONE, _FAILED = b"d", b"f"
+PATIENCE = 0.02  # longer waits in all than the work would have taken here are a sign of a busy machine [s]
+REST = 512  # questions that are then answered here; raise it where a busy machine stays busy
 
 
 def can_fork() -> bool:
@@ -57,7 +59,8 @@ class Beside:
             answer = beside.answer(question)  # f(question), to the bit
 
     What was not begun, or another question, or one that the copy failed at, is computed here: so a guess that turns
-    out wrong costs time and changes nothing. All of it is computed here where no copy can be made (`can_fork`).
+    out wrong costs time and changes nothing. All of it is computed here where no copy can be made (`can_fork`), and for
+    a while where no processor is free for the copy: then waiting for it takes longer than the work.
     """
 
     def __init__(self, function: Callable[[np.ndarray], np.ndarray], asks: int, answers: int):
@@ -68,6 +71,9 @@ class Beside:
         self._process: multiprocessing.context.ForkProcess | None = None
         self._wires: tuple[int, ...] = ()  # here: to write to, to read from
         self._lock = threading.Lock()
+        self._begun = 0.0  # `spent` when it was asked
+        self._won = 0.0  # time that the copy has saved of late, negative if it has cost some [s]
+        self._rest = 0  # questions that will not be begun
 
     @property
     def spent(self) -> float:
@@ -95,11 +101,15 @@ class Beside:
         """Begins what will probably be asked. What was begun before and never asked for is waited for and lost."""
         with self._lock:
             self._finish()
-            if self._wires:
+            if self._rest > 0:
+                self._rest -= 1
+            elif self._wires:
                 self._question[:] = question
+                self._begun, start = self.spent, time.perf_counter()
                 with contextlib.suppress(OSError):  # the copy has ended
                     os.write(self._wires[0], _DONE)
                     self._asked = question.tobytes()
+                self._won -= time.perf_counter() - start
 
     def answer(self, question: np.ndarray) -> np.ndarray:
         """The function's value."""
@@ -113,8 +123,13 @@ class Beside:
         if not self._asked:
             return False
         self._asked = b""
+        start = time.perf_counter()
         with profiling.work(profiling.WAITING):
-            return os.read(self._wires[1], 1) == _DONE  # nothing at all, if it has ended
+            done = os.read(self._wires[1], 1) == _DONE  # nothing at all, if it has ended
+        self._won = min(self._won + self.spent - self._begun - (time.perf_counter() - start), PATIENCE)
+        if self._won < -PATIENCE:
+            self._won, self._rest = 0.0, REST
+        return done
 
     def _serve(self, ask: int, tell: int, others: Sequence[int]) -> None:
         for wire in others:
