@@ -207,10 +207,14 @@ class Stances:
         best = self._follow(X_BA, angles, side, grasp, near.get(side) if near else None, least, posture)
         if len(arm) <= 6 or not best[1]:
             return best
+        first = compose(X_BA, self.valve.grasp(grasp.handle, grasp.sign))
         for start in seeds(arm)[:OTHERS]:
             if len(best[0]) == len(angles) and min(best[1]) >= self.config.margin_good:
                 break
-            way = self._follow(X_BA, angles, side, grasp, start, least, posture)
+            q = self.robot.inverse(side, first, start, posture)
+            if q is None:
+                continue
+            way = self._follow(X_BA, angles, side, grasp, q, least, posture)
             if way[1] and (len(way[0]), min(way[1])) > (len(best[0]), min(best[1])):
                 best = way
         return best
