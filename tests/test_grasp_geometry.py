@@ -123,7 +123,7 @@ def test_a_comfortable_stance_exists_over_the_whole_range(height, tilt, bar, tur
     off = axis - base[:2]
     forward = np.array([np.cos(base[2]), np.sin(base[2])])
     assert off @ [-forward[1], forward[0]] == pytest.approx(0, abs=1e-9)
-    assert CONFIG.distance_min - 1e-9 <= off @ forward <= CONFIG.distance_max + 1e-9
+    assert ROBOT.stand[0] - 1e-9 <= off @ forward <= ROBOT.stand[1] + 1e-9
     # and it holds what it says, along the arc at a finer step
     X_BA = compose(inverse(planar(*base)), X_OA)
     fine = stances(arc_step=0.02).best_arc(X_BA, np.deg2rad(turn))
@@ -189,11 +189,25 @@ def test_handles_are_shared_the_better_way():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"distance_min": 0.3}, {"distance_min": 0.9}, {"arc_step": 0.0}, {"standoff": float("nan")}]
+    "changes", [{"distance_min": 0.2}, {"distance_max": 4.0}, {"arc_step": 0.0}, {"standoff": float("nan")}]
 )
 def test_bad_config_is_refused_by_name(changes):
     with pytest.raises(ConfigError, match=f"stance.{next(iter(changes))}"):
         StanceConfig(**changes).check()
+
+
+@pytest.mark.parametrize("changes", [{"distance_min": 0.9}, {"distance_step": 0.005, "distance_max": 1.2}])
+def test_distances_that_the_robot_does_not_have_are_refused_by_name(changes):
+    with pytest.raises(ConfigError, match=f"stance.{next(iter(changes))} must be at"):
+        stances(**changes)
+
+
+def test_a_robot_that_does_not_say_where_it_stands_tries_from_its_footprint_to_its_reach():
+    pr2 = Robot.load(description.find("pr2/pr2.robot.yaml"))
+    near, far = pr2.stand
+    assert near == pytest.approx(np.hypot(0.34, 0.34) + 0.2)
+    assert pr2.forward("left", pr2.arms["left"].work)[0, 3] < far < 1.0
+    assert ROBOT.stand == (0.70, 0.84)
 
 
 def test_arms_that_touch_something_where_they_draw_back_have_no_stance():

@@ -15,6 +15,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPor
 from pydrake.systems.primitives import Multiplexer
 
 from valve_drake import named_files
+from valve_drake.behaviors.base_approach import BaseApproachConfig
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.behaviors.grasp_geometry import Stances
 from valve_drake.behaviors.hybrid_rotation import HybridRotation
@@ -299,7 +300,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             robot.waist,
             robot.gaze_signs,
         ),
-        BaseApproachSystem(scenario.base_approach, valve),
+        BaseApproachSystem(_clear(scenario.base_approach, robot), valve),
         StancePlannerSystem(StancePlanner(scenario.stance_planner, stances)),
         KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, robot, valve, area)),
         ImageServoSystem(ImageServo(scenario.image_servo, robot, taught)),
@@ -312,6 +313,11 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             else []
         ),
     ]
+
+
+def _clear(config: BaseApproachConfig, robot: Robot) -> BaseApproachConfig:
+    """The clearance is at least what the base needs to turn before a panel."""
+    return dc.replace(config, clearance=max(config.clearance, robot.turning_room))
 
 
 def make_diagram(

@@ -79,7 +79,7 @@ class BaseApproachConfig(Config):
     )
     pre_stance: float = number(0.6, 0.1, 2.0, "distance of the pre-stance behind the stance [m]")
     look_ahead: float = number(0.22, 0.05, 2.0, "of the line law; raise it if the base swings about the line [m]")
-    clearance: float = number(0.62, 0.55, 1.5, "base centre to panel plane, at least [m]")
+    clearance: float = number(0.62, 0.55, 1.5, "base centre to panel plane, at least; a long base keeps more [m]")
     position_tolerance: float = number(0.015, 0.002, 0.1, "of the base at the stance [m]")
     heading_tolerance: float = number(0.0175, 0.002, 0.2, "of the base at the stance [rad]")
     still_time: float = number(0.3, 0.05, 5.0, "at rest for so long, the stance is reached [s]")

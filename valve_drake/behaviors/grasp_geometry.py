@@ -26,10 +26,8 @@ class StanceConfig(Config):
     """Scenario key `stance`: which places to stand at are tried."""
 
     KEY = "stance"
-    distance_min: float = number(
-        0.70, 0.5, 1.2, "least distance that is tried, shoulder axis to the panel along the floor [m]"
-    )
-    distance_max: float = number(0.84, 0.5, 1.2, "largest distance that is tried [m]")
+    distance_min: float = number(0.0, 0.0, 3.0, "least distance that is tried, base to panel; 0: the robot's [m]")
+    distance_max: float = number(0.0, 0.0, 3.0, "largest distance that is tried; 0: the robot's [m]")
     distance_step: float = number(0.02, 0.005, 0.2, "between two distances; halving it doubles the search [m]")
     aside: float = number(0.12, 0.0, 0.5, "to either side that is tried where straight before the valve fails [m]")
     lift_step: float = number(0.08, 0.01, 1.0, "between two heights of a lift that are tried [m]")
@@ -45,11 +43,19 @@ class StanceConfig(Config):
     margin_min: float = number(0.15, 0.01, 1.0, "least arm margin that is accepted (1 is comfortable)")
 
     def relations(self, key: str) -> None:
-        span = self.distance_max - self.distance_min
-        require(span >= 0, f"{key}.distance_min", f"at most distance_max, {self.distance_max:g}", self.distance_min)
-        few = span <= (MAX_PLACES - 1) * self.distance_step
-        least = span / (MAX_PLACES - 1)
-        require(few, f"{key}.distance_step", f"at least {least:.3g}: {MAX_PLACES} distances", self.distance_step)
+        for name in ("distance_min", "distance_max"):
+            value = getattr(self, name)
+            require(value == 0 or value >= 0.3, f"{key}.{name}", "0 (the robot's) or at least 0.3", value)
+
+    def distances(self, stand: tuple[float, float]) -> np.ndarray:
+        """What is tried, from near to far (K,) [m]. stand: the robot's. Raises ConfigError: none, or too many."""
+        low, high = self.distance_min or stand[0], self.distance_max or stand[1]
+        require(low <= high, f"{self.KEY}.distance_min", f"at most the largest distance, {high:g}", low)
+        most = MAX_PLACES - 1
+        few = high - low <= most * self.distance_step
+        words = f"at least {(high - low) / most:.3g}: {MAX_PLACES} distances"
+        require(few, f"{self.KEY}.distance_step", words, self.distance_step)
+        return np.arange(low, high + 1e-9, self.distance_step)
 
 
 def standoff(X_AG: np.ndarray, view_G: np.ndarray, distance: float) -> np.ndarray:
@@ -121,6 +127,7 @@ class StanceSearch:
     X_OA: np.ndarray
     turn_angle: float
     places: tuple[tuple[Place, ...], ...]
+    kept: bool = False  # the first group keeps a lift where it is: it will do where it is accepted
     group: int = 0
     index: int = 0  # of the next place in its group
     arc: Arc | None = None  # of the place before, to start from
@@ -144,6 +151,9 @@ class Stances:
     config: StanceConfig
     view: Mapping[str, np.ndarray]
     is_free: Free
+
+    def __post_init__(self) -> None:
+        self.config.distances(self.robot.stand)
 
     # ------------------------------------------------------------ one grasp
     def check_arc(
@@ -344,7 +354,8 @@ class Stances:
 
         posture: of a stance that was found for nearly the same valve: kept while it serves, since lifts are slow.
         """
-        return StanceSearch(X_OA, turn_angle, self._places(X_OA, viewer, posture))
+        kept = posture is not None and self.robot.lift > 0
+        return StanceSearch(X_OA, turn_angle, self._places(X_OA, viewer, posture), kept=kept)
 
     def _places(
         self, X_OA: np.ndarray, viewer: np.ndarray, posture: np.ndarray | None
@@ -355,12 +366,13 @@ class Stances:
         angle = heading(X_OA, viewer)
         left = np.array([-np.sin(angle), np.cos(angle)])
         stem = compose(X_OA, self.valve.X_AP())[:2, 3]  # at the panel
-        distances = np.arange(c.distance_min, c.distance_max + 1e-9, c.distance_step)
+        distances = c.distances(self.robot.stand)
         bases = [_before(stem, distance, angle) for distance in distances]
         home = self.robot.posture.home
         groups = [tuple(Place(base) for base in bases)]
-        if posture is not None and np.max(np.abs(posture - home), initial=0.0) > 1e-3:
-            groups.insert(0, tuple(Place(base, posture) for base in bases))
+        if posture is not None and self.robot.lift:
+            kept = tuple(Place(base, posture) for base in bases)
+            groups = [kept, *(groups if np.max(np.abs(posture - home)) > 1e-3 else [])]
         if raised := self._postures():
             groups.append(tuple(Place(base, posture) for posture in raised for base in bases))
         if not has_heading(X_OA):  # a valve that lies flat is turned from any side
@@ -396,7 +408,8 @@ class Stances:
         group, index = s.group, s.index + 1
         if index == len(s.places[group]):
             group, index = group + 1, 0
-        more = group < len(s.places) and (index > 0 or margin < c.margin_good)
+        good = c.margin_min if s.kept and group == 1 else c.margin_good
+        more = group < len(s.places) and (index > 0 or margin < good)
         done = margin >= c.margin_enough or not more
         fresh = dc.replace(s, group=group, index=index, arc=arc, turned=0.0, grasps=0, least=1.0)
         return dc.replace(fresh, best=best, margin=margin, done=done)

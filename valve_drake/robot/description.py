@@ -28,16 +28,23 @@ TORQUE = "torque"
 
 @dc.dataclass
 class BaseDescription(Config):
-    """Key `base`. The frame is B of frames.py. A holonomic base drives as a differential one, for the present."""
+    """Key `base`. The frame is B of frames.py. A holonomic base drives as a differential one, for the present.
+
+    stand: nearest and farthest place before a panel that are tried; by default from where the footprint is clear of it
+    to where the arms end.
+    """
 
     frame: str = plain("", "link or frame on the floor, x forward, z up")
     drive: str = choice("differential", tuple(DRIVES), "how it moves")
     footprint: list[float] = numbers([0.3, 0.3], 0.05, 2.0, "half length, half width [m]")
+    stand: list[float] = numbers([], 0.3, 3.0, "its frame to the panel, along the floor [m]", count=(0, 2))
     speed: list[float] = numbers([0.8, 1.2], 0.01, 3.0, "forward, (sideways,) yaw [m/s, rad/s]", count=(0, 3))
     acceleration: list[float] = numbers([0.8, 2.0], 0.05, 5.0, "of the same [m/s^2, rad/s^2]", count=(0, 3))
 
     def relations(self, key: str) -> None:
         require(bool(self.frame), f"{key}.frame", "given", self.frame)
+        good = not self.stand or (len(self.stand) == 2 and self.stand[0] <= self.stand[1])
+        require(good, f"{key}.stand", "none, or the nearest and the farthest", self.stand)
         count = DRIVES[self.drive]
         if count:
             for name in ("speed", "acceleration"):

@@ -89,6 +89,10 @@ class RobotKinematics(Protocol):
         """How many of the posture's joints are the lift; they come first."""
 
     @property
+    def stand(self) -> tuple[float, float]:
+        """The nearest and the farthest place before a panel that are worth a try, base to panel along the floor [m]."""
+
+    @property
     def hands(self) -> Mapping[str, HandLoad]: ...
 
     @property

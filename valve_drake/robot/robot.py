@@ -39,6 +39,7 @@ from valve_drake.valve.valve import Valve
 
 _ORIGIN = np.zeros(3)
 _OPENINGS = 65  # positions of a gripper's joint at which its opening is read
+ROOM = 0.2  # between a base that turns and a panel [m]
 _TOUCH = 1e-4  # an opening may lack so much of what is asked for [m]
 
 
@@ -143,6 +144,8 @@ class Robot:
         self.follow(q)
         self._home_q = q
         self._chains = {side: self._chain(side, joint) for side in SIDES}
+        self._plant.SetPositions(self._context, self._home_q)
+        self._ends = [float(self._pose(chain.shoulder)[0, 3]) + chain.reach for chain in self._chains.values()]
         self._check_sides()
         self.gaze_signs = _locked(self._gaze_signs())
         self.grippers = MappingProxyType({side: self._gripper(side, joint[f"grippers.{side}.joint"]) for side in SIDES})
@@ -173,6 +176,19 @@ class Robot:
     def lift(self) -> int:
         """How many of the posture's joints are the lift; they come first."""
         return len(self.description.lift.joints)
+
+    @property
+    def stand(self) -> tuple[float, float]:
+        """The nearest and the farthest place before a panel that are worth a try, base to panel along the floor [m]."""
+        base = self.description.base
+        if base.stand:
+            return base.stand[0], base.stand[1]
+        return self.turning_room, max(self.turning_room, *self._ends)
+
+    @property
+    def turning_room(self) -> float:
+        """The base's frame to a panel, along the floor, where it can turn before it [m]."""
+        return math.hypot(*self.description.base.footprint) + ROOM
 
     @property
     def groups(self) -> Groups:
