@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 
-.PHONY: run test slow robots lint format readers draw clean
+.PHONY: run test slow robots lint format readers dask campaign draw clean
 
 run: $(READY)
 	$(BIN)/valve-drake run $(ARGS)
@@ -35,6 +35,18 @@ readers: $(READY)
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[readers]'
 	-npm install --fetch-retries=0 --silent --no-audit --no-fund --no-package-lock --prefix tests/readers
 	LOG=$(LOG) $(BIN)/python -m pytest -m readers -rs
+
+# A short campaign, and the hardest draws that were found: fails if a valve is not turned.
+RUNS ?= 6
+campaign: $(READY)
+	rm -rf logs/ci-campaign logs/ci-again
+	$(BIN)/valve-drake campaign --runs $(RUNS) --jobs 2 --out logs/ci-campaign
+	$(BIN)/valve-drake campaign --again tests/failures.yaml --runs 2 --jobs 2 --out logs/ci-again
+
+# Campaigns on Dask's workers; skipped if it cannot be installed.
+dask: $(READY)
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dask]'
+	$(BIN)/python -m pytest -n 0 -rs tests/test_campaign.py -k "dask or worker"
 
 draw: $(READY)
 	$(BIN)/valve-drake draw

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import csv
+import functools
 import io
 import json
 import math
@@ -32,6 +33,8 @@ with open(os.environ["BEGUN"], "a") as file:
     file.write(f"{seed}\\n")
 with open(os.environ["BEGUN"] + ".pids", "a") as file:
     file.write(f"{os.getpid()}\\n")
+with open(os.environ["BEGUN"] + ".parents", "a") as file:
+    file.write(f"{os.getppid()}\\n")
 time.sleep(float(os.environ.get("TAKES", "0")))
 if seed == 13:
     sys.exit("segmentation fault, or so")
@@ -532,6 +535,60 @@ def test_dask_gives_the_same_records(tmp_path, fake, monkeypatch):
         there = campaign.run(trials, pool)
     strip = [[r | {"times": 0} for r in records] for records in (local, there)]
     assert strip[0] == strip[1]
+
+
+@pytest.fixture
+def workers(tmp_path, fake):
+    """A scheduler and two workers, each a process of its own on this machine: its address, the workers."""
+    pytest.importorskip("distributed")
+    address = tmp_path / "scheduler.json"
+    here = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}  # of the stand-in
+    programs = [["dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]]
+    programs += [["dask_worker", "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", "--no-dashboard"]] * 2
+    started = []
+    try:
+        for name, *options in programs:
+            words = [sys.executable, "-m", f"distributed.cli.{name}", *options, "--scheduler-file", str(address)]
+            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            started.append(subprocess.Popen(words, env=os.environ | here, cwd=tmp_path, **quiet))
+            deadline = time.monotonic() + 60
+            while not address.exists() and time.monotonic() < deadline:
+                time.sleep(0.05)
+        yield json.loads(address.read_text())["address"], started[1:]
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def test_a_scheduler_and_two_workers_as_processes_of_their_own_give_the_same_records(
+    tmp_path, fake, workers, monkeypatch
+):
+    address, processes = workers
+    local = run(wanted(tmp_path / "a", 8))
+    program = trial.PROGRAM
+    monkeypatch.setattr(campaign, "perform", lambda t: _performed(t, program))
+    (fake.with_name("begun.parents")).unlink()
+    with executors.executor("dask", 1, address) as pool:
+        pool._client.wait_for_workers(2, timeout=60)
+        there = campaign.run(wanted(tmp_path / "b", 8), pool)
+    assert [r | {"times": 0} for r in there] == [r | {"times": 0} for r in local]
+    assert {int(pid) for pid in fake.with_name("begun.parents").read_text().split()} == {p.pid for p in processes}
+
+
+def test_a_worker_that_dies_loses_no_run(tmp_path, fake, workers, monkeypatch):
+    address, processes = workers
+    monkeypatch.setattr(campaign, "perform", functools.partial(_performed, program=trial.PROGRAM))
+
+    def show(progress):
+        if progress.done == 2:
+            processes[0].kill()
+
+    with executors.executor("dask", 1, address) as pool:
+        pool._client.wait_for_workers(2, timeout=60)
+        records = campaign.run(wanted(tmp_path / "out", 8), pool, show)
+    assert [r["seed"] for r in records] == list(range(1, 9))
+    assert [turned(r) for r in records] == [k != 7 for k in range(1, 9)]
 
 
 def _performed(one: Trial, program: tuple[str, ...]):

@@ -133,7 +133,7 @@ def _frame(title: str, x: tuple[float, float], y: tuple[float, float], body: str
 
 def _range(values: list[float]) -> tuple[float, float]:
     low, high = min(values), max(values)
-    room = 0.05 * (high - low) or max(0.5 * abs(high), 1e-6)
+    room = 0.05 * (high - low) or 0.5 * abs(high) or 0.5
     return low - room, high + room
 
 
@@ -141,8 +141,9 @@ def _histogram(title: str, values: list[float | None]) -> tuple[str, Markup | No
     known = [v for v in values if v is not None and math.isfinite(v)]
     if not known:
         return title, None
-    counts, edges = np.histogram(known, bins=min(24, max(4, round(math.sqrt(len(known))))))
-    x, y = _range(known), (0.0, float(max(counts)) * 1.08)
+    x, bins = _range(known), min(24, max(4, round(math.sqrt(len(known)))))
+    counts, edges = np.histogram(known, bins | 1, range=x if min(known) == max(known) else None)
+    y = 0.0, float(max(counts)) * 1.08
     bars = []
     for count, a, b in zip(counts, edges, edges[1:]):
         left, right = (_LEFT + (v - x[0]) / (x[1] - x[0]) * (_WIDE - 6 - _LEFT) for v in (a, b))
