@@ -21,6 +21,7 @@ from valve_drake.stations.contract import vectors
 from valve_drake.stations.plant_system import PlantSystem
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
+from valve_drake.valve.valve import Valve
 
 VALVE = ValveConfig(height=1.0, friction=4.0, position=0.0)
 BASE = np.array([-0.76, 0.0, 0.0])
@@ -45,7 +46,7 @@ class Hands:
         self.arms = arms = {LEFT: left, RIGHT: right}
         start = ROBOT.named(base=BASE, torso=ROBOT.torso.home, arms=arms, opening=opening)
         offsets = {side: np.zeros(len(arms[side])) for side in SIDES}
-        self.plant = PlantSystem(VALVE, (0.1, 0.1), start, offsets, ROBOT)
+        self.plant = PlantSystem(VALVE, Valve(), start, offsets, ROBOT)
         self.simulator = Simulator(self.plant)
         self.context = self.simulator.get_mutable_context()
         zeros = {name: np.zeros(size) for name, size in vectors(GROUPS, "in").items()}
