@@ -2,6 +2,7 @@
 
 import json
 import math
+import wave
 
 import numpy as np
 import pytest
@@ -156,3 +157,63 @@ def test_a_link_that_is_lost_in_mid_turn_holds_the_grasp_and_the_turn_goes_on_by
     ]
     assert max(forces) < 30.0
     assert replayed(path, capsys)
+
+
+@pytest.mark.slow
+def test_a_whole_session_by_voice_from_wav_files_over_a_radio(tmp_path, capsys):
+    """A voice that the recogniser was not taught with; nothing is typed. Other speech in between moves nothing."""
+    recogniser = pytest.importorskip("valve_drake.voice.recogniser")
+    from valve_drake.operator.ear import read_wav
+    from valve_drake.voice import radio
+    from valve_drake.voice.synthesis import Speaker, installed, say
+
+    pytest.importorskip("pyopen_wakeword")
+    voice = Speaker("espeak", "en-gb+f2")
+    if not installed(voice):
+        pytest.skip("espeak-ng is not installed")
+
+    def recorded(text, seed):
+        """A sentence over the radio, as a file, read back."""
+        silence = np.zeros(RATE, np.float32)
+        received = radio.transmit(
+            np.concatenate([silence[: RATE // 2], say(text, voice), silence]), radio.AT_20_DB, seed
+        )
+        path = tmp_path / f"{seed}.wav"
+        with wave.open(str(path), "wb") as file:
+            file.setnchannels(1)
+            file.setsampwidth(2)
+            file.setframerate(RATE)
+            file.writeframes(np.round(received * 32767).astype("<i2").tobytes())
+        return read_wav(path, "--file")
+
+    noise = recorded("the weather report for the islands", 99)
+    hiss = np.round(32767 * radio.transmit(np.zeros(RATE, np.float32), radio.AT_20_DB, 7, level=0.1)).astype(np.int16)
+    rng = np.random.default_rng(0)
+    path = tmp_path / "voice.mcap"
+    session = Session(
+        *("seed=1", "simulation.valve.travel=3.0", "simulation.valve.position=1.0"),
+        ear=recogniser.Recogniser(),
+        noise=lambda count: np.roll(hiss, int(rng.integers(RATE)))[:count],
+        limit=240.0,
+    )
+    session.run(
+        path,
+        (lambda state: state.linked, noise),
+        (lambda state: True, recorded("robot, open the valve", 1)),
+        (said("open by 90 degrees: say confirm"), recorded("confirm", 2)),
+        (lambda state: state.mode == "turn" and state.turned >= 20, recorded("stop", 3)),
+        (ended("stopped"), recorded("robot, close the valve by thirty degrees", 4)),
+        (said("close by 30 degrees: say confirm"), recorded("confirm", 5)),
+        (ended("done"), lambda session: None),
+    )
+    verdicts = [says.split(":")[0] for _, says in session.told if says.startswith(("stopped: ", "turned: "))]
+    assert verdicts == ["stopped", "turned"]
+    log = LogReader(path)
+    moves = [(one.words, one.outcome) for one in exchanges(log) if one.outcome == "given"]
+    assert [words for words, _ in moves] == ["confirm", "stop", "confirm"]
+    heard = sum(len(m.data) // 2 for _, _, m in log.messages([foxglove.AUDIO]))
+    assert heard == pytest.approx(session.modes[-1][0] * RATE, rel=0.02)
+    assert replayed(path, capsys)
+    page = tmp_path / "page.html"
+    assert cli.main(["review", str(path), "--html", str(page)]) == 0
+    assert "What the operator said" in page.read_text()
