@@ -7,12 +7,13 @@ R_AB rotation, V_AB = [w; v], F = [torque; force].
     O  odometry: where the base stood at the start; what controllers use as a world. It drifts against W.
     B  base: on the floor, x forward, y left, z up; the frame that robot.yaml names
     L, R  head cameras: x right, y down, z forward; pixel (0, 0) is the centre of the first pixel (OpenCV)
-    A, D  left and right wrist cameras (not calibrated: no code may use their lens or mounting)
-    V  marker: origin at the rectangle's centre, x along the handles, z into the panel
+    A  the valve's axis: origin on it at the grip plane, z along it into the panel; turns with the valve
+    V  marker: origin at the rectangle's centre, z into the panel; `valve.marker` says where it is in A
+    (the wrist cameras have no letter: they are not calibrated, and no code may use their lens or mounting)
     G, K  left and right hand, at the grip point: z approach, y closing direction, x = y cross z (along the bar)
     S, T  left and right wrist sensor: the child's frame of the fixed joint that robot.yaml names
 
-Valve angle: positive opens = counter-clockwise seen from the robot = about -z of V.
+Valve angle: positive is counter-clockwise as seen from the robot = about -z of A; `valve.opens` says which sense opens.
 """
 
 import math

@@ -77,7 +77,7 @@ class Scenario(Config):
     seed: int = number(0, 0, 2**31 - 1, "of all random numbers")
     station: str = choice("simulated", STATIONS, "the robot that the blocks are wired to")
     command: str = choice("open", ("open", "close"), "what to do with the valve")
-    angle: float = number(1.5707963267948966, 0.01, 6.29, "to turn [rad]")
+    angle: float = number(1.5707963267948966, 0.01, 12.6, "to turn [rad]")
     time_limit: float = number(240.0, 0.1, 3600.0, "of the whole run; operators end theirs themselves [s]")
     robot: str = plain("robot/robot.yaml", "a path, one below models/, or a package:// URL")
     head_calibration: str = plain("", "in the place of the robot's: a path, or one below models/")

@@ -96,6 +96,7 @@ OTHERS = 4  # postures that a redundant arm's way begins from, beside the first
 JUMP = 1.0  # a joint that moves so far between two angles of the turn is on another branch [rad]
 ONE_GRASP = 2.3  # a longer turn is not tried with one grasp alone [rad]
 AROUND = (0.5, -0.5, 1.0, -1.0)  # sides from which a valve with an upright axis is tried, off the nearest [rad]
+FAR = 2.5  # a comfortable grasp that turns so far ends the search for a better one [rad]
 CROSSED = 0.02  # the left hand is to the right of the right one by more than this [m]
 PAIRS = 6  # of handles, at most, that are tried of each kind
 
@@ -118,8 +119,26 @@ class Place:
 
 
 @dc.dataclass(frozen=True, eq=False)
+class ArcSearch:
+    """A search for the grasps at one place, cut into portions of one pair each: see `Stances.advance_arc`."""
+
+    X_BA: np.ndarray
+    turn_angle: float
+    groups: tuple[tuple[Pair, ...], ...]  # of `Stances.pairs`
+    whole: bool  # see `Stances.check_arc`
+    near: Arc | None = None
+    least: float = 0.0
+    posture: np.ndarray | None = None
+    group: int = 0
+    index: int = 0  # of the next pair in its group
+    best: Arc = Arc()
+    begun: bool = False
+    done: bool = False
+
+
+@dc.dataclass(frozen=True, eq=False)
 class StanceSearch:
-    """A search for a stance, cut into portions of one grasp's arc each: `Stances.advance` makes the next one.
+    """A search for a stance, cut into portions of one pair of grasps each: `Stances.advance` makes the next one.
 
     places: by group; the search ends with a place of `margin_enough`, or after a group that has one of `margin_good`.
     """
@@ -130,6 +149,7 @@ class StanceSearch:
     kept: bool = False  # the first group keeps a lift where it is: it will do where it is accepted
     group: int = 0
     index: int = 0  # of the next place in its group
+    arcs: ArcSearch | None = None  # at this place
     arc: Arc | None = None  # of the place before, to start from
     turned: float = 0.0  # of the turn, by the grasps at this place that are found [rad]
     grasps: int = 0  # how many these are
@@ -316,6 +336,44 @@ class Stances:
                     for flip in flips
                 )
 
+    def begin_arc(
+        self,
+        X_BA: np.ndarray,
+        turn_angle: float,
+        near: Arc | None = None,
+        least: float = 0.0,
+        posture: np.ndarray | None = None,
+    ) -> ArcSearch:
+        """A search for the grasps that turn the valve the best; see `best_arc`."""
+        whole = abs(turn_angle) <= ONE_GRASP
+        asked = turn_angle if whole else float(np.copysign(ONE_GRASP / 2, turn_angle))
+        groups = tuple(group for group in self.pairs(X_BA, asked))
+        return self._onwards(ArcSearch(X_BA, turn_angle, groups, whole, near, least, posture))
+
+    def advance_arc(self, search: ArcSearch) -> ArcSearch:
+        """The search after one more pair of grasps."""
+        c, s = self.config, search
+        pair = s.groups[s.group][s.index]
+        start = s.near.q if s.near is not None and dict(s.near.grasps) == dict(pair) else None
+        bound = max(s.best.margin, s.least) if s.whole else 0.0
+        arc = self.check_arc(s.X_BA, s.turn_angle, pair, start, bound, s.posture, whole=s.whole)
+        best = arc if _better(arc, s.best, s.whole) else s.best
+        served = best.margin >= c.margin_good and (s.whole or abs(best.turn) > FAR)
+        after = dc.replace(s, index=s.index + 1, best=best, begun=s.begun or arc.begun)
+        return dc.replace(after, done=True) if served else self._onwards(after)
+
+    def _onwards(self, search: ArcSearch) -> ArcSearch:
+        """The search at the next pair that is worth trying; done if there is none."""
+        group, index, s = search.group, search.index, search
+        while group < len(s.groups):
+            others = group % 2 == 1 and not s.begun  # other fingers reach no farther
+            if not others and index < len(s.groups[group]):
+                return dc.replace(s, group=group, index=index)
+            if s.best.margin >= self.config.margin_min:
+                break
+            group, index = group + 1, 0
+        return dc.replace(s, done=True)
+
     def best_arc(
         self,
         X_BA: np.ndarray,
@@ -326,25 +384,10 @@ class Stances:
     ) -> Arc:
         """The first grasps of `pairs` that serve for the whole turn, the best of their group; for a turn that is longer
         than one grasp reaches, those that turn the farthest. near: a like arc; the rest: as of `check_arc`."""
-        c = self.config
-        whole = abs(turn_angle) <= ONE_GRASP
-        asked = turn_angle if whole else float(np.copysign(ONE_GRASP / 2, turn_angle))
-        best, begun = Arc(), False
-        for k, group in enumerate(self.pairs(X_BA, asked)):
-            if k % 2 == 1 and not begun:
-                continue  # other fingers reach no farther
-            for pair in group:
-                start = near.q if near is not None and dict(near.grasps) == dict(pair) else None
-                bound = max(best.margin, least) if whole else 0.0
-                arc = self.check_arc(X_BA, turn_angle, pair, start, bound, posture, whole=whole)
-                begun = begun or arc.begun
-                if _better(arc, best, whole):
-                    best = arc
-                if best.margin >= c.margin_good and (whole or abs(best.turn) > 2.5):
-                    break
-            if best.margin >= c.margin_min:
-                break
-        return best
+        search = self.begin_arc(X_BA, turn_angle, near, least, posture)
+        while not search.done:
+            search = self.advance_arc(search)
+        return search.best
 
     # ------------------------------------------------------------ where to stand
     def begin(
@@ -393,13 +436,20 @@ class Stances:
         return [np.concatenate([q, joints.home[count:]]) for q in raised if np.max(np.abs(q - home)) > 1e-3]
 
     def advance(self, search: StanceSearch) -> StanceSearch:
-        """The search after one more grasp: at a place, grasps follow each other until the turn is made."""
+        """The search after one more pair of grasps: at a place, grasps follow each other until the turn is made."""
         c, s = self.config, search
         place = s.places[s.group][s.index]
-        X_BA = turned(compose(inverse(planar(*place.base)), s.X_OA), s.turned)
         asked = s.turn_angle - s.turned
-        alone = s.grasps == 0 and abs(asked) <= ONE_GRASP
-        arc = self.best_arc(X_BA, asked, s.arc, max(s.margin, 0.0) if alone else 0.0, place.posture)
+        if s.arcs is None:
+            X_BA = turned(compose(inverse(planar(*place.base)), s.X_OA), s.turned)
+            alone = s.grasps == 0 and abs(asked) <= ONE_GRASP
+            arcs = self.begin_arc(X_BA, asked, s.arc, max(s.margin, 0.0) if alone else 0.0, place.posture)
+        else:
+            arcs = s.arcs
+        arcs = self.advance_arc(arcs)
+        if not arcs.done:
+            return dc.replace(s, arcs=arcs)
+        s, arc = dc.replace(s, arcs=None), arcs.best
         least, left = min(s.least, arc.margin), asked - arc.turn
         if arc.margin >= c.margin_min and abs(left) > 1e-9 and least > s.margin and s.grasps < 3:
             # Four grasps turn a valve round, mostly; then they repeat themselves.

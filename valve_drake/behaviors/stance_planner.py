@@ -13,7 +13,7 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.behaviors.grasp_geometry import Stances, StanceSearch, standoff
+from valve_drake.behaviors.grasp_geometry import Arc, ArcSearch, Stances, StanceSearch, standoff
 from valve_drake.behaviors.joint_path import PathSearch
 from valve_drake.config import Config, number
 from valve_drake.frames import compose
@@ -57,6 +57,7 @@ class Memory:
     begun: float = -1e9  # when the last search for a stance began [s]
     stance: Stance = Stance()
     number: int = -1  # of the last request
+    arc_search: ArcSearch | None = None
     path_search: PathSearch | None = None
     vias_left: bool = False  # the via poses are still to be found
     grasps: GraspPlan = GraspPlan()
@@ -85,6 +86,8 @@ class StancePlanner:
             return self._take(m, request)
         if m.path_search is not None:
             return self._path(m, request)
+        if m.arc_search is not None:
+            return self._grasps(m, request)
         return self._stance(time, m, mode, estimate) if mode.mode == Mode.FINE_APPROACH else m
 
     # ------------------------------------------------------------ stance
@@ -118,15 +121,23 @@ class StancePlanner:
     # ------------------------------------------------------------ requests
     def _take(self, m: Memory, request: PlanRequest) -> Memory:
         """A new request: the one before is dropped."""
-        m = changed(m, number=request.number, path_search=None)
+        m = changed(m, number=request.number, path_search=None, arc_search=None)
         if request.kind == "grasps":
-            return changed(m, grasps=self._grasps(request))
+            search = self.stances.begin_arc(request.X_BA, request.turn_angle, posture=request.posture)
+            return changed(m, arc_search=search)
         if request.kind == "path":
             return changed(m, path_search=PathSearch(request.start, request.goal), vias_left=request.valve)
         return m
 
-    def _grasps(self, request: PlanRequest) -> GraspPlan:
-        arc = self.stances.best_arc(request.X_BA, request.turn_angle, posture=request.posture)
+    def _grasps(self, m: Memory, request: PlanRequest) -> Memory:
+        """One portion of the search for grasps."""
+        assert m.arc_search is not None
+        search = self.stances.advance_arc(m.arc_search)
+        if not search.done:
+            return changed(m, arc_search=search)
+        return changed(m, arc_search=None, grasps=self._plan_of(request, search.best))
+
+    def _plan_of(self, request: PlanRequest, arc: Arc) -> GraspPlan:
         found = arc.margin >= self.stances.config.margin_min
         plan = GraspPlan(number=request.number, found=found, X_BA=request.X_BA, margin=arc.margin)
         if not found:

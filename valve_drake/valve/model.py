@@ -119,13 +119,13 @@ def _made(plant: MultibodyPlant, valve: Valve) -> ModelInstanceIndex:
     X_PA = inverse(valve.X_AP())
     # the hub, from the panel to the grip plane, and the post that carries the marker's face
     _solid(plant, wheel, RigidTransform([0, 0, -p.depth / 2 - 0.005]), Cylinder(HUB, p.depth - 0.01), "hub", DARK)
-    X_face = compose(X_PA, valve.X_AV(), make(np.eye(3), np.array([0, 0, 0.002])))
+    X_face = compose(X_PA, valve.X_AV(), make(np.eye(3), np.array([0, 0, 0.003])))  # 1 mm behind the marker
     _solid(plant, wheel, _rigid(X_face), Box(m.face, m.face, 0.004), "face", FACE)
     foot = np.array([m.xyz[0], m.xyz[1], 0.0])
     if math.hypot(*m.xyz[:2]) > HUB:  # an arm from the hub to below the face
         _beam(plant, wheel, X_PA, np.zeros(3), foot, 0.016, "face_arm", STEEL, solid=True)
-    rise = -m.xyz[2]
-    if rise > 0.01:
+    rise = -m.xyz[2] - 0.005  # to within the face
+    if rise > 0.005:
         X_post = compose(X_PA, make(np.eye(3), foot + [0, 0, -rise / 2]))
         _solid(plant, wheel, _rigid(X_post), Cylinder(0.02, rise), "post", STEEL)
     for k, handle in enumerate(valve.handles):
