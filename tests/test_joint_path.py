@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from valve_drake.behaviors.joint_path import STEP, Path, find_path, line_is_free
+from valve_drake.behaviors.joint_path import PORTION, STEP, Path, PathSearch, find_path, line_is_free
 
 SPEED, ACCELERATION = 0.9, 2.0
 
@@ -133,6 +133,18 @@ def test_the_search_finds_its_way_out_of_a_pocket():
 def test_the_same_problem_has_the_same_path():
     a, b = (find_path(joints(0), joints(1), [], Ball()) for _ in range(2))
     assert a.tobytes() == b.tobytes()
+
+
+def test_a_portion_asks_few_questions_and_portions_make_the_same_path():
+    """However long the lines are: nobody waits for more than PORTION answers."""
+    ball, most = Ball(), 0
+    search = PathSearch(joints(0), joints(1), (joints(0.5, 0.1),))
+    while not search.done:
+        before = ball.asked
+        search = search.advance(ball)
+        most = max(most, ball.asked - before)
+    assert 0 < most <= PORTION
+    assert search.points.tobytes() == find_path(joints(0), joints(1), [joints(0.5, 0.1)], Ball()).tobytes()
 
 
 def test_a_blocked_goal_has_no_path_and_costs_one_question():

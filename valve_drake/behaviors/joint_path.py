@@ -6,11 +6,13 @@ short-cuts; every sample is checked by the caller's `is_free(q (n,)) -> bool` (l
 
 import dataclasses as dc
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 Free = Callable[[np.ndarray], bool]
 STEP = 0.03  # largest joint step between two checks [rad]
+PORTION = 12  # poses checked in one portion of a search; each takes 0.1 to 1 ms
 LEAVE = 0.06  # poses this near to the start are not checked: the robot is there, free or not [rad]
 
 
@@ -59,89 +61,144 @@ def _trapezoid(t: float, duration: float, reach: float, acceleration: float) -> 
     return acceleration * ramp * (t - ramp / 2)
 
 
+@dc.dataclass(frozen=True)
+class Line:
+    """A straight line in joint space, whose samples after `a` are checked one by one; the middle ones first, which
+    fail most often."""
+
+    a: np.ndarray
+    b: np.ndarray
+
+    def samples(self) -> list[float]:
+        """Their shares of the way, in the order in which they are checked."""
+        count = max(1, int(np.ceil(np.max(np.abs(self.b - self.a)) / STEP)))
+        return [k / count for k in sorted(range(1, count + 1), key=lambda k: abs(k / count - 0.5))]
+
+
 def line_is_free(a: np.ndarray, b: np.ndarray, is_free: Free) -> bool:
-    """Whether every checked sample of the joint line after `a` is free; the middle first, which fails most often."""
-    count = max(1, int(np.ceil(np.max(np.abs(b - a)) / STEP)))
-    order = sorted(range(1, count + 1), key=lambda k: abs(k / count - 0.5))
-    return all(is_free(a + (b - a) * (k / count)) for k in order)
+    """Whether every checked sample of the joint line after `a` is free."""
+    return all(is_free(a + (b - a) * share) for share in Line(a, b).samples())
+
+
+Tree = tuple[tuple[np.ndarray, int], ...]  # nodes, each with the index of the one it grew from
+GOAL, STRAIGHT, VIA, GROW, JOIN, SHORTEN = "goal", "straight", "via", "grow", "join", "shorten"
 
 
 @dc.dataclass(frozen=True)
 class PathSearch:
-    """A search for a path, cut into portions: `advance` makes the next one. Every portion is a few milliseconds' work.
+    """A search for a path, cut into portions: `advance` makes the next one, with PORTION poses checked.
 
-    First the straight line, then one via pose a portion, then one try of RRT-Connect, then short-cuts.
+    First the goal alone, then the straight line, then the via poses, then RRT-Connect, then short-cuts.
     """
 
     start: np.ndarray
     goal: np.ndarray
     vias: tuple[np.ndarray, ...] = ()
     tries: int = 400  # of RRT-Connect
-    portion: int = 0
-    trees: "tuple[Tree, Tree]" = ((), ())  # from the start and from the goal
+    stage: str = GOAL
+    at: int = 0  # which via, try, or pair of points to leave out what lies between
+    lines: tuple[Line, ...] = ()  # being checked: all must be free
+    checked: int = 0  # samples of the first of them
+    trees: tuple[Tree, Tree] = ((), ())  # from the start and from the goal
     way: tuple[np.ndarray, ...] = ()  # what RRT-Connect has found, being shortened
-    cuts: int = 0  # pairs of its points that do not see each other
     done: bool = False
     points: np.ndarray | None = None  # (N, n), once found
 
     def advance(self, is_free: Free) -> "PathSearch":
         """The search after one more portion; the start need not be free: the robot is there."""
-        start, goal = self.start, self.goal
+        s, start = self, self.start
 
         def free(q: np.ndarray) -> bool:
             return bool(np.max(np.abs(q - start)) < LEAVE) or is_free(q)
 
-        k = self.portion
-        after = dc.replace(self, portion=k + 1)
-        if self.way:
-            return after._shorten(free)
-        if k == 0:
-            if not is_free(goal):
-                return dc.replace(after, done=True)
-            return after._found([start, goal]) if line_is_free(start, goal, free) else after
-        if k <= len(self.vias):
-            via = self.vias[k - 1]
-            straight = line_is_free(start, via, free) and line_is_free(via, goal, free)
-            return after._found([start, via, goal]) if straight else after
-        tried = k - len(self.vias) - 1
-        if tried >= self.tries:
-            return dc.replace(after, done=True)
-        return after._connect(tried, free)
+        for _ in range(PORTION):
+            if s.done:
+                break
+            if not s.lines:
+                s = dc.replace(s, lines=(Line(s.goal, s.goal),))  # the first portion
+            line = s.lines[0]
+            shares = line.samples()
+            q = line.a + (line.b - line.a) * shares[s.checked]
+            if not (is_free(q) if s.stage == GOAL else free(q)):
+                s = s._blocked()
+            elif s.checked + 1 < len(shares):
+                s = dc.replace(s, checked=s.checked + 1)
+            elif len(s.lines) > 1:
+                s = dc.replace(s, lines=s.lines[1:], checked=0)
+            else:
+                s = s._free()
+        return s
+
+    def _try(self, stage: str, at: int, *lines: Line, **changes: Any) -> "PathSearch":
+        return dc.replace(self, stage=stage, at=at, lines=lines, checked=0, **changes)
 
     def _found(self, points: Sequence[np.ndarray]) -> "PathSearch":
         return dc.replace(self, done=True, points=np.array(points))
 
-    def _connect(self, tried: int, free: Free) -> "PathSearch":
-        """One try of RRT-Connect: a tree grows towards a random pose, the other one towards what it has reached."""
-        trees = self.trees if tried else (((self.start, -1),), ((self.goal, -1),))
-        grow, other = trees[tried % 2], trees[1 - tried % 2]
+    def _free(self) -> "PathSearch":
+        """What follows when the lines are free."""
+        start, goal, at = self.start, self.goal, self.at
+        if self.stage == GOAL:
+            return self._try(STRAIGHT, 0, Line(start, goal))
+        if self.stage == STRAIGHT:
+            return self._found([start, goal])
+        if self.stage == VIA:
+            return self._found([start, self.vias[at], goal])
+        if self.stage == GROW:  # towards what this tree has reached now grows the other one
+            grow, other = self._order()
+            target = self.lines[0].b
+            grown = (*grow, (target, _nearest(grow, target)))
+            q = other[_nearest(other, target)][0]
+            return self._try(JOIN, at, Line(q, target), trees=(grown, other) if at % 2 == 0 else (other, grown))
+        if self.stage == JOIN:
+            grow, other = self._order()
+            near = _nearest(other, self.lines[0].b)
+            joined = (*other, (self.lines[0].b, near))
+            trees = (grow, joined) if at % 2 == 0 else (joined, grow)
+            way = (*_branch(trees[0])[::-1], *_branch(trees[1])[1:])
+            return dc.replace(self, way=way)._shorten(0)
+        i, j = _pairs(len(self.way))[at]
+        return dc.replace(self, way=(*self.way[: i + 1], *self.way[j:]))._shorten(0)
+
+    def _blocked(self) -> "PathSearch":
+        """What follows when one of the lines is not free."""
+        if self.stage == GOAL:
+            return dc.replace(self, done=True)
+        if self.stage == STRAIGHT:
+            return self._via(0)
+        if self.stage == VIA:
+            return self._via(self.at + 1)
+        if self.stage == SHORTEN:
+            return self._shorten(self.at + 1)
+        return self._grow(self.at + 1)
+
+    def _via(self, k: int) -> "PathSearch":
+        if k >= len(self.vias):
+            return dc.replace(self, trees=(((self.start, -1),), ((self.goal, -1),)))._grow(0)
+        return self._try(VIA, k, Line(self.start, self.vias[k]), Line(self.vias[k], self.goal))
+
+    def _grow(self, tried: int) -> "PathSearch":
+        """A tree grows by at most 0.4 rad towards a random pose."""
+        if tried >= self.tries:
+            return dc.replace(self, done=True)
+        grow = self.trees[tried % 2]
         low, high = np.minimum(self.start, self.goal) - 0.8, np.maximum(self.start, self.goal) + 0.8
-        grown = _extend(grow, _random(tried).uniform(low, high), free, 0.4)
-        if grown is None:
-            return dc.replace(self, trees=trees)
-        joined = _extend(other, grown[-1][0], free, np.inf)
-        order = (grown, joined or other)
-        trees = order if tried % 2 == 0 else order[::-1]
-        if joined is None:
-            return dc.replace(self, trees=trees)
-        return dc.replace(self, trees=trees, way=(*_branch(trees[0])[::-1], *_branch(trees[1])[1:]))
+        to = np.random.Generator(np.random.SFC64(tried)).uniform(low, high)  # the same problem gives the same path
+        q = grow[_nearest(grow, to)][0]
+        reach = float(np.max(np.abs(to - q)))
+        return self._try(GROW, tried, Line(q, q + (to - q) * min(1.0, 0.4 / reach)))
 
-    def _shorten(self, free: Free) -> "PathSearch":
+    def _order(self) -> tuple[Tree, Tree]:
+        """The tree that grows in this try, and the other one."""
+        return self.trees if self.at % 2 == 0 else self.trees[::-1]
+
+    def _shorten(self, k: int) -> "PathSearch":
         """Leaves out way points that lie between two that see each other, the farthest apart first."""
-        way, cuts = self.way, self.cuts
-        for _ in range(4):
-            pairs = [(i, i + apart) for apart in range(len(way) - 1, 1, -1) for i in range(len(way) - apart)]
-            if cuts >= len(pairs):
-                return self._found(way)
-            i, j = pairs[cuts]
-            if line_is_free(way[i], way[j], free):
-                way, cuts = (*way[: i + 1], *way[j:]), 0
-            else:
-                cuts += 1
-        return dc.replace(self, way=way, cuts=cuts)
-
-
-Tree = tuple[tuple[np.ndarray, int], ...]  # nodes, each with the index of the one it grew from
+        pairs = _pairs(len(self.way))
+        if k >= len(pairs):
+            return self._found(self.way)
+        i, j = pairs[k]
+        return self._try(SHORTEN, k, Line(self.way[i], self.way[j]))
 
 
 def find_path(
@@ -154,18 +211,13 @@ def find_path(
     return search.points
 
 
-def _random(k: int) -> np.random.Generator:
-    """The same problem gives the same path."""
-    return np.random.Generator(np.random.SFC64(k))
+def _pairs(count: int) -> list[tuple[int, int]]:
+    """Of way points with others between them, the farthest apart first."""
+    return [(i, i + apart) for apart in range(count - 1, 1, -1) for i in range(count - apart)]
 
 
-def _extend(tree: Tree, to: np.ndarray, is_free: Free, most: float) -> Tree | None:
-    """The tree with one more node, at most `most` from its nearest one towards `to`; None if the way is blocked."""
-    near = int(np.argmin([np.max(np.abs(q - to)) for q, _ in tree]))
-    q = tree[near][0]
-    reach = float(np.max(np.abs(to - q)))
-    target = to if reach <= most else q + (to - q) * (most / reach)
-    return (*tree, (target, near)) if line_is_free(q, target, is_free) else None
+def _nearest(tree: Tree, to: np.ndarray) -> int:
+    return int(np.argmin([np.max(np.abs(q - to)) for q, _ in tree]))
 
 
 def _branch(tree: Tree) -> list[np.ndarray]:

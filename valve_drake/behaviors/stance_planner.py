@@ -156,16 +156,17 @@ class StancePlanner:
         )
 
     def _path(self, m: Memory, request: PlanRequest) -> Memory:
-        """One portion of the search for a path; where the straight line is blocked, the via poses are made."""
+        """One portion of the search for a path; near a valve the via poses are the first."""
         search = m.path_search
         assert search is not None
         X_BA = request.X_BA if request.valve else None
         arms, split = self.robot.arms, self.robot.split
 
         def is_free(q: np.ndarray) -> bool:
-            return all(arms[side].within(part) for side, part in split(q).items()) and self.stances.is_free(X_BA, q)
+            within = all(arms[side].within(part) for side, part in split(q).items())
+            return within and self.stances.is_free(X_BA, q, request.posture)
 
-        if search.portion == 1 and m.vias_left:
+        if m.vias_left:
             vias = tuple(self.vias(request.start, request.goal, request.posture))
             return changed(m, path_search=dc.replace(search, vias=vias), vias_left=False)
         search = search.advance(is_free)
