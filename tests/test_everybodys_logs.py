@@ -353,6 +353,18 @@ def test_a_log_that_was_only_cut_is_recovered_with_0_and_a_word(tmp_path, capsys
     assert run(capsys, "review", tmp_path / "a.mcap.active")[0] == 3
 
 
+def test_a_cut_chunk_whose_length_reads_as_an_end_of_data_is_a_cut(tmp_path, capsys):
+    data = own_log(tmp_path / "a.mcap").read_bytes()
+    start = chunks(data)[3][0]
+    head = struct.pack("<BQ", 6, 0x40F)  # its bytes 1 to 13 are a DataEnd record: opcode 0x0F, length 4
+    (tmp_path / "b.mcap").write_bytes(
+        data[:start] + head + data[start + 9 : start + 40] + bytes(len(data) - start - 40)
+    )
+    code, out, _ = run(capsys, "recover", tmp_path / "b.mcap", "-o", tmp_path / "c.mcap")
+    assert "192 messages" in out and "breaks off" in out
+    assert code == 0 and "bytes are damaged" not in out
+
+
 @pytest.mark.parametrize("filler", [b"\xa5", b"\0"])
 def test_a_cut_is_told_from_bytes_that_were_written_over(tmp_path, capsys, filler):
     data = own_log(tmp_path / "a.mcap").read_bytes()

@@ -347,8 +347,9 @@ class Contents:
                     unpacked(self._data, chunk_at(self._data, record))
                 elif record.opcode == Opcode.ATTACHMENT:
                     attachment_to(self._data, record, load=False)
-                elif record.opcode == Opcode.DATA_END and record.end - record.start != 4:
-                    continue
+                elif record.opcode == Opcode.DATA_END:  # 9 bytes that a chunk's length may look like
+                    if record.end - record.start != 4 or not self._follows(record.end, limit, 1):
+                        continue
                 elif record.opcode in _ALWAYS:
                     parse(self._data, record)
                 elif not self._follows(position, limit, _CHAIN):
