@@ -62,6 +62,7 @@ def main(log: Path, folder: Path) -> None:
         simulation.light,
         simulation.camera,
         scenario.seed,
+        robot.description,
     )
     spans = {span.mode: span for span in summarize(reader).spans}
     turn, drive = spans["turn"], spans["fine_approach"]
