@@ -3,9 +3,7 @@
 A description names joints and frames of the model; whether the model has them is checked where it is read
 (robot/model.py, robot/robot.py). SI units and radians. A list of joints goes from the body outwards.
 
-So far a run takes robots whose groups have as many joints as our own (diagram.robot_of refuses the others), and these
-keys are checked and not yet used: base.footprint, base.speed and base.acceleration (base_approach and
-command_selector have their own), lift.speed.
+Checked and not yet used: base.speed and base.acceleration (command_selector has its own).
 """
 
 import dataclasses as dc
