@@ -1,6 +1,7 @@
 """The operator's desk: its keys, its page, what it hears; and the command around it."""
 
 import io
+import json
 import wave
 
 import numpy as np
@@ -10,11 +11,12 @@ from pydrake.lcm import DrakeLcm
 from valve_drake import cli
 from valve_drake.checks import ConfigError
 from valve_drake.console import console
-from valve_drake.messages import OperatorState
+from valve_drake.messages import ModeState, OperatorCommand, OperatorPackets, OperatorState, Status
 from valve_drake.operator.desk import KEYS, Desk
 from valve_drake.operator.desk_link import DeskLink
 from valve_drake.operator.ear import PIECE, pieces, read_wav
 from valve_drake.operator.grammar import Heard, Kind, parse
+from valve_drake.operator.operator_channel import OperatorChannelConfig, State, step
 from valve_drake.operator.operator_link import OperatorLink
 from valve_drake.operator.wire import RATE
 from valve_drake.stations.bus import Bus
@@ -213,3 +215,88 @@ def test_a_script_whose_words_nobody_hears_fails_in_one_line(capsys, monkeypatch
     monkeypatch.setattr("valve_drake.commands.operator.ANSWER", 0.1)
     assert cli.main(["operator", "--say", "stop", "--set", "hardware.lcm_url=memq://"]) == 1
     assert "no program listens" in capsys.readouterr().err
+
+
+class Elsewhere:
+    """Instead of `time` in the command: while it sleeps, a program in the same process listens and answers."""
+
+    def __init__(self, monkeypatch, mode="idle"):
+        self.lcm, self.now, self.modes = DrakeLcm("memq://"), 200.0, [mode]
+        monkeypatch.setattr("valve_drake.stations.bus.DrakeLcm", lambda url: self.lcm)
+        monkeypatch.setattr("valve_drake.stations.bus.wall", self)
+        monkeypatch.setattr("valve_drake.commands.operator.time", self)
+        monkeypatch.setattr(DeskLink.__init__, "__defaults__", (self.monotonic,))
+        monkeypatch.setattr(Desk.__init__, "__defaults__", (None, True, self.monotonic))
+        self.program = OperatorLink(Bus(HardwareConfig(lcm_url="memq://"), self.lcm))
+        self.program.bus.clock = self.monotonic
+        self.state, self.sounds, self.ahead = State(), [], []
+
+    def monotonic(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += max(seconds, 0.01)
+        self.sounds += self.program.sounds()
+        packets = self.program.take(self.now) or OperatorPackets(count=self.state.packets)
+        mode = ModeState(mode=self.modes[-1], activation=len(self.modes), verdict="turned", reason="seen")
+        config = OperatorChannelConfig(wire="lcm")
+        before = self.state.command
+        self.state = step(config, 1.5, 12.6, self.state, self.now, packets, OperatorCommand(), mode, Status(), "")
+        if self.state.command is not before:
+            runs = {"open": ["search"] + ["turn"] * 30 + ["done"], "stop": ["stopped"]}
+            self.ahead = runs.get(self.state.command.command, [])
+        if self.ahead:
+            self.modes.append(self.ahead.pop(0))
+        self.program.tell(self.state.shown)
+
+
+def script(capsys, *arguments):
+    code = cli.main(["operator", "--set", "hardware.lcm_url=memq://", *arguments])
+    return code, capsys.readouterr()
+
+
+def test_a_script_says_its_words_waits_for_the_end_of_its_run_and_tells_it(monkeypatch, capsys):
+    elsewhere = Elsewhere(monkeypatch)
+    code, told = script(capsys, "--say", "robot, open the valve", "--say", "confirm", "--json")
+    found = json.loads(told.out)
+    assert code == 0 and found["good"] and (found["mode"], found["verdict"]) == ("done", "turned")
+    assert [line["text"] for line in found["said"] if line["who"] == "you"] == ["robot, open the valve", "confirm"]
+    elsewhere.sleep(0.1)
+    assert elsewhere.state.holder == 0  # it has left
+
+
+def test_a_script_whose_words_are_refused_exits_1(monkeypatch, capsys):
+    Elsewhere(monkeypatch, mode="turn")
+    code, told = script(capsys, "--say", "robot, open the valve")
+    assert code == 1 and "robot: not now: turn is under way, say stop first" in told.out
+
+
+def test_a_wav_file_is_heard_and_sent_at_its_own_speed(monkeypatch, capsys, tmp_path):
+    ear = Ear((3, Heard("robot open", 0.9)), (5, Heard("confirm", 0.8)), (6, Heard("hm", 0.1)))
+    monkeypatch.setattr("valve_drake.operator.ear.recogniser", lambda: ear)
+    elsewhere = Elsewhere(monkeypatch)
+    sound = np.arange(16000, dtype=np.int16)
+    code, told = script(capsys, "--file", str(wav(tmp_path / "a.wav", sound)))
+    assert code == 0 and "you: robot open (0.90)" in told.out and "robot: turned: seen" in told.out
+    assert "not clear: hm (0.10)" in told.out
+    got = np.concatenate([one.samples for one in elsewhere.sounds])
+    assert np.array_equal(got[:16000], sound)
+
+
+def test_a_radio_puts_sound_on_the_bus_and_says_nothing(monkeypatch, capsys, tmp_path):
+    elsewhere = Elsewhere(monkeypatch)
+    code, told = script(capsys, "--file", str(wav(tmp_path / "a.wav", np.ones(16000))), "--radio")
+    assert code == 0 and told.out == "1.0 s of sound were sent\n"
+    elsewhere.sleep(0.1)
+    elsewhere.sleep(0.1)
+    assert sum(len(one.samples) for one in elsewhere.sounds) == 13 * 1280
+    assert elsewhere.state.holder == 0
+
+
+def test_listening_without_the_extra_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
+    def missing(name):
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr("valve_drake.operator.ear.importlib.import_module", missing)
+    code, told = script(capsys, "--file", str(wav(tmp_path / "a.wav", np.zeros(100))))
+    assert code == 2 and "pip install 'valve-drake[voice]'" in told.err and len(told.err.splitlines()) == 1

@@ -14,6 +14,7 @@ the paper is a LeafSystem; together they are one Drake diagram:
 | section of the paper                  | file                                  | block                |
 |---------------------------------------|---------------------------------------|----------------------|
 | 2 robot and strategy (four stages)    | diagram.py, supervisor/supervisor.py  | supervisor           |
+| 2 audio commands sent via radio       | operator/grammar.py, operator_channel.py | operator_channel  |
 | 2 stage 1: centre of the red area     | perception/stereo_positioning.py      | stereo_positioning   |
 | 2 stages 1, 2: driving                | behaviors/base_approach.py            | base_approach        |
 | 2 stage 3: hands by kinematics        | behaviors/kinematic_approach.py       | kinematic_approach   |

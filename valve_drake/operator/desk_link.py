@@ -20,6 +20,7 @@ from valve_drake.stations.lcm_channels import AUDIO, CONTROLLER, OPERATOR, WORDS
 from valve_drake.stations.reports import PRESENT
 
 SILENT = 3.0  # a program that was not heard for longer is gone; raise it for one that often waits for a processor [s]
+STAMP = 2e-6  # stamps are of microseconds [s]
 MOST = 64  # messages that are taken in at once
 PATIENCE = 3.0  # words that were not taken within this time are given up [s]
 
@@ -38,7 +39,7 @@ class DeskLink:
         self._current: OperatorPacket | None = None  # is said until the program has heard it
         self._queue: list[tuple[float, Heard]] = []  # when it was said, and what
         self._sequence = 0
-        self._sent_at = float("-inf")
+        self._sent_at = self._stamp = float("-inf")
         self._refused = False
         self._tail = Tail()
         self._told_others = False
@@ -133,7 +134,7 @@ class DeskLink:
     def leave(self) -> None:
         """Gives the robot's ear back: the end of this desk."""
         now = self.clock()
-        self.bus.send(WORDS, words_message(OperatorPacket(self.number, now, said=now, leaves=True), self.program))
+        self._put(OperatorPacket(speaker=self.number, said=now, leaves=True), now)
 
     def _begin(self, said: float, heard: Heard) -> None:
         self._sequence += 1
@@ -152,8 +153,11 @@ class DeskLink:
     def _send(self, now: float) -> None:
         self._sent_at = now
         idle = OperatorPacket(speaker=self.number, said=now)
-        packet = dc.replace(self._current or idle, sent=now)
-        self.bus.send(WORDS, words_message(packet, self.program))
+        self._put(self._current or idle, now)
+
+    def _put(self, packet: OperatorPacket, now: float) -> None:
+        self._stamp = max(now, self._stamp + STAMP)  # each is later than the one before
+        self.bus.send(WORDS, words_message(dc.replace(packet, sent=self._stamp), self.program))
 
     def _hear(self, key: str, message: Any) -> None:
         try:
