@@ -7,12 +7,11 @@ import pytest
 from robot_facts import ROBOT
 from robot_variants import crooked_wrist, seven_joints, variant, with_roll
 
-from valve_drake.behaviors.grasp_geometry import hand_in_valve, turned
 from valve_drake.frames import compose, make, rot_x, rotation, rotation_vector
 from valve_drake.messages import LEFT, RIGHT, SIDES
-from valve_drake.perception.marker import Marker
 from valve_drake.robot import kinematics
 from valve_drake.robot.robot import Robot
+from valve_drake.valve.valve import Valve, turned
 
 FACING = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # R_BV of a valve straight ahead
 CLOSE = 1e-6  # of a pose [rad, m]
@@ -74,13 +73,14 @@ def test_the_jacobian_is_the_derivative_of_the_pose(robot):
 
 
 def test_along_a_turn_the_joints_move_in_small_steps(robot):
-    X_BV = make(FACING @ rot_x(0.05), np.array([0.66, 0.0, 1.0]))
+    X_BA, valve = make(FACING @ rot_x(0.05), np.array([0.68, 0.0, 1.0])), Valve()
     for side in SIDES:
-        X_VG = hand_in_valve(side, False, Marker())
-        q = robot.inverse(side, compose(X_BV, X_VG))
+        handle = next(k for k, one in enumerate(valve.handles) if (one.xyz[0] < 0) == (side == LEFT))
+        X_AG = valve.grasp(handle, 1.0 if side == LEFT else -1.0)
+        q = robot.inverse(side, compose(X_BA, X_AG))
         assert q is not None
         for angle in np.linspace(0, np.pi / 2, 200)[1:]:
-            X = compose(turned(X_BV, angle), X_VG)
+            X = compose(turned(X_BA, angle), X_AG)
             new = robot.inverse(side, X, q)
             assert new is not None and np.abs(new - q).max() < 0.06 and off(robot.forward(side, new), X) < CLOSE
             q = new
