@@ -226,6 +226,22 @@ def test_pieces_that_are_lost_are_made_good_by_those_that_follow_and_none_comes_
     assert [sound.time for sound in got[::2]] == pytest.approx([5.0 + 0.32 * k for k in range(10)])
 
 
+def test_a_desk_that_listens_to_the_bus_hears_what_a_radio_puts_there_once_and_in_order():
+    pair = Pair(desks=2).run()
+    radio, desk = pair.desks
+    heard = []
+    desk.listen(heard.append)
+    whole = (np.arange(10 * 1280) % 30000).astype(np.int16)
+    for piece in whole.reshape(10, 1280):
+        radio.sound(piece)
+        pair.run(1 / 32)
+    assert np.array_equal(np.concatenate(heard), whole)
+    pair.lcm.Publish(desk.bus.name(AUDIO), b"no sound")
+    before = desk.dropped
+    pair.run(1 / 32)
+    assert desk.dropped == before + 1
+
+
 def test_another_desks_sound_begins_anew():
     pair = Pair(desks=2).run()
     for desk in pair.desks:
