@@ -14,6 +14,7 @@ from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.commands import (
     calibrate,
     campaign,
+    check_robot,
     draw,
     estimate,
     experiment,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 COMMANDS = (
     run,
     campaign,
+    check_robot,
     operator,
     twin,
     scenario,
