@@ -18,14 +18,14 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.sensors import CameraInfo
 
 from valve_drake import named_files
-from valve_drake.behaviors.grasp_geometry import Place, StanceConfig, Stances, hand_in_valve, turned
+from valve_drake.behaviors.grasp_geometry import Place, StanceConfig, Stances
 from valve_drake.behaviors.taught import load_made_for, load_taught
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.config import Uniform
 from valve_drake.diagram import robot_of
-from valve_drake.frames import compose, inverse, make, planar
+from valve_drake.frames import compose, inverse, planar
 from valve_drake.messages import SIDES
 from valve_drake.robot import description as descriptions
 from valve_drake.robot.kinematics import Joints
@@ -37,14 +37,17 @@ from valve_drake.stations.scene import add_scene, panel_pose
 from valve_drake.stations.servos import add_servos
 from valve_drake.stations.simulation_config import ValveConfig
 from valve_drake.teaching import made_for
+from valve_drake.valve.valve import turned
 
 HEIGHTS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3)  # of the valve's axis [m]
 TILTS = (-0.3, 0.0, 0.3)  # of the panel; positive leans away at its top [rad]
 TURN = math.pi / 2  # [rad]
 NEAREST, FARTHEST = 0.5, 1.2  # base to panel, that are tried [m]
-STEP, LIFT_STEP = 0.05, 0.12  # between two that are tried, and between two heights of a lift [m]
+STEP, LIFT_STEP = 0.07, 0.15  # between two that are tried, and between two heights of a lift [m]
+ARC_STEP = 0.4  # of the turn [rad]
 ENOUGH = 0.6  # margin at which the search ends
-BUDGET = 35.0  # of processor time for the table; what is left of it then is not searched [s]
+ROW = 6.0  # of processor time for one row of the table [s]
+BUDGET = 40.0  # of processor time for the table; what is left of it then is not searched [s]
 FRONT = 0.05  # least room between the base's front and the panel [m]
 DEAR = 1.0  # share of an effort limit that must not be passed
 HIDDEN, BLIND = 0.02, 0.25  # share of the middle of an eye's image that folded arms may hide: doubtful, useless
@@ -53,9 +56,11 @@ NARROW = 0.015  # room on each side of the handle below which a hand must be led
 SLACK = 0.01  # by which the fingers' shapes may be nearer to each other than the pads' surfaces [m]
 SWINGS = 0.3  # damping ratio of a servo below which it swings
 DROOPS = 0.02  # of a joint below its command, by the arm's weight [rad]
+DEEP = 0.005  # overlap of two links that is no matter of their hulls' roughness [m]
 OUTER = 3  # arm joints from the shoulder on whose links may touch the trunk at home
 FIELD = 1.0  # upright, of an eye whose lens is not known [rad]
 EYE = 320, 240  # of an eye's picture [px]
+BEHIND = np.array([-0.75, 0.65, 0.35]), np.array([-0.45, -0.75, 0.6])  # views of a robot at the valve
 SAMPLES = 7  # of the turn at which efforts are looked at
 NIGHT = (1.0, 0.0, 1.0)  # a sky in a colour that no robot has
 
@@ -163,7 +168,7 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
     file = named_files.find(scenario, "robot")
     report.name = Path(descriptions.load(file).model).stem
     try:
-        robot = Robot.load(file)
+        robot = Robot.load(file, scenario.valve)
     except ConfigError as error:
         report.add(MISSING, "load", "", str(error).removeprefix(f"{file}: "))
         report.seconds = time.process_time() - start
@@ -171,7 +176,7 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
     _groups(report, robot)
     _head(report, robot, scenario)
     _base(report, robot)
-    collision = CollisionModel(robot, scenario.marker)
+    collision = CollisionModel(robot)
     _home(report, robot, collision)
     _servoing(report, robot, scenario)
     _grippers(report, robot, scenario)
@@ -223,15 +228,33 @@ def _home(report: Report, robot: Robot, collision: CollisionModel) -> None:
     for pair in collision.touching(None, robot.home)[:4]:
         report.add(MISSING, "reach", "arms.*.home", f"touches or is nearer than collision.padding: {pair}")
     outer = {link: k for side in SIDES for link, k in _links(robot, side).items()}
-    for a, b in sorted(collision.ignored):
-        if max(abs(outer.get(a, 0)), abs(outer.get(b, 0))) > OUTER and _apart(outer.get(a, 0), outer.get(b, 0)):
-            text = f"{a} touches {b} there, which collision.ignore then never sees"
+    for a, b, depth in _overlaps(robot):
+        if _apart(outer.get(a, 0), outer.get(b, 0)):
+            text = f"{a} is {1e3 * depth:.0f} mm inside {b} there, and `collision` has it that they may touch"
             report.add(DOUBTFUL, "reach", "arms.*.home", text)
 
 
+def _overlaps(robot: Robot) -> list[tuple[str, str, float]]:
+    """The links that overlap by more than DEEP at home, whatever `collision` permits, and how far [m]."""
+    model = robot.model
+    root = model.diagram.CreateDefaultContext()
+    model.plant.SetPositions(model.plant.GetMyMutableContextFromRoot(root), robot.rest(robot.opening))
+    query = model.scene_graph.get_query_output_port().Eval(model.scene_graph.GetMyContextFromRoot(root))
+    inspector = model.scene_graph.model_inspector()
+    out: dict[tuple[str, str], float] = {}
+    for pair in query.ComputeSignedDistancePairwiseClosestPoints(0.0):
+        if pair.distance > -DEEP:
+            continue
+        bodies = [model.plant.GetBodyFromFrameId(inspector.GetFrameId(shape)) for shape in (pair.id_A, pair.id_B)]
+        if all(body.model_instance() == model.robot for body in bodies):
+            key = min(b.name() for b in bodies), max(b.name() for b in bodies)
+            out[key] = max(out.get(key, 0.0), -pair.distance)
+    return [(a, b, depth) for (a, b), depth in sorted(out.items())]
+
+
 def _apart(a: int, b: int) -> bool:
-    """Two links, by _links, that are not of one arm's outer part."""
-    return a * b <= 0 or abs(abs(a) - abs(b)) > OUTER
+    """Two links, by _links, that do not belong in each other: of both arms, or far along one and at its beginning."""
+    return a * b < 0 or abs(abs(a) - abs(b)) > OUTER
 
 
 def _links(robot: Robot, side: str) -> dict[str, int]:
@@ -305,14 +328,14 @@ def _servoing(report: Report, robot: Robot, scenario: Scenario) -> None:
     try:
         path = named_files.find(scenario, "taught")
         load_taught(path)
-        if unlike := made_for(robot, scenario.marker).unlike(load_made_for(path)):
+        if unlike := made_for(robot, scenario.valve).unlike(load_made_for(path)):
             report.add(DOUBTFUL, "servo", "taught", f"of {unlike}: `valve-drake teach` makes them anew")
     except ConfigError as error:
         report.add(MISSING, "servo", "taught", str(error))
 
 
 def _grippers(report: Report, robot: Robot, scenario: Scenario) -> None:
-    width, margin = scenario.marker.handle_width, scenario.hybrid_rotation.grip_margin
+    width, margin = max(h.width for h in scenario.valve.handles), scenario.hybrid_rotation.grip_margin
     room = (robot.opening - width) / 2
     for side in SIDES:
         gripper = robot.grippers[side]
@@ -410,35 +433,34 @@ def _servos(report: Report, robot: Robot) -> None:
 # ---------------------------------------------------------------- reach
 
 
-def _reach(
-    report: Report, robot: Robot, scenario: Scenario, collision: CollisionModel
-) -> tuple[ValveConfig, Place] | None:
-    """Fills the table -> the valve that is turned best, and from where."""
-    marker, spec = scenario.marker, scenario.stance
+def _reach(report: Report, robot: Robot, scenario: Scenario, collision: CollisionModel) -> Best | None:
+    """Fills the table."""
+    spec = scenario.stance
     nearest = max(NEAREST, robot.description.base.footprint[0] + FRONT)
     tried = dc.replace(spec, distance_min=nearest, distance_max=FARTHEST, distance_step=STEP, margin_enough=ENOUGH)
-    tried = dc.replace(tried, lift_step=max(LIFT_STEP, spec.lift_step))
-    stances = Stances(robot, marker, tried, _views(scenario), collision.is_free)
+    tried = dc.replace(
+        tried, lift_step=max(LIFT_STEP, spec.lift_step), arc_step=max(ARC_STEP, spec.arc_step), aside=0.0
+    )
+    stances = Stances(robot, scenario.valve, tried, _views(scenario), collision.is_free)
     fixed = scenario.simulation.valve
     own = {round(value(fixed.height), 3) for value in (_least, _most)}
     rows = [(height, 0.0) for height in sorted({*HEIGHTS, *own})]
-    rows += [(height, tilt) for height in HEIGHTS[::2] for tilt in TILTS if tilt]
+    rows += [(height, tilt) for height in HEIGHTS[1::2] for tilt in TILTS if tilt]
     best: tuple[float, ValveConfig, Place] | None = None
     start = time.process_time()
     for k, (height, tilt) in enumerate(rows):
         if time.process_time() - start > BUDGET:
-            report.add(
-                NOTE, "reach", "", f"the last {len(rows) - k} rows of the table were not searched: it takes long"
-            )
+            text = f"the last {len(rows) - k} rows of the table are not searched: they would take over {BUDGET:g} s"
+            report.add(NOTE, "reach", "", text)
             break
         valve = ValveConfig(height=height, tilt=tilt)
-        X_WV = compose(panel_pose(valve), make(np.eye(3), np.array([0, 0, -marker.panel_depth])))
-        place, margin = stances.find(X_WV, TURN)
+        X_WA = compose(panel_pose(valve), inverse(scenario.valve.X_AP()))
+        place, margin = _find(stances, X_WA)
         if margin < 0:
             report.reach.append(Reach(height, tilt, -1.0))
             continue
-        X_BV = compose(inverse(planar(*place.base)), X_WV)
-        effort, joint = _effort(report, robot, stances, X_BV, place)
+        X_BA = compose(inverse(planar(*place.base)), X_WA)
+        effort, joint = _effort(report, robot, stances, X_BA, place)
         distance = float(np.linalg.norm(place.base[:2]))
         posture = () if place.posture is None else tuple(round(float(q), 4) for q in place.posture)
         report.reach.append(Reach(height, tilt, margin, distance, posture, effort, joint))
@@ -446,6 +468,14 @@ def _reach(
             best = margin, valve, place
     _judge_reach(report, spec, own)
     return None if best is None else best[1:]
+
+
+def _find(stances: Stances, X_WA: np.ndarray) -> tuple[Place, float]:
+    """As Stances.find, for ROW seconds of processor time at the most."""
+    search, end = stances.begin(X_WA, TURN, np.array([-2.0, 0.0])), time.process_time() + ROW
+    while not search.done and time.process_time() < end:
+        search = stances.advance(search)
+    return search.best or Place(np.zeros(3)), search.margin
 
 
 def _views(scenario: Scenario) -> Mapping[str, np.ndarray]:
@@ -486,30 +516,30 @@ def _judge_reach(report: Report, spec: StanceConfig, own: set[float]) -> None:
         report.add(DOUBTFUL, "reach", "", text)
 
 
-def _effort(report: Report, robot: Robot, stances: Stances, X_BV: np.ndarray, place: Place) -> tuple[float, str]:
+def _effort(report: Report, robot: Robot, stances: Stances, X_BA: np.ndarray, place: Place) -> tuple[float, str]:
     """The largest share of an effort limit along the turn, by weight and the hands' push, and whose it is."""
-    arc = stances.best_arc(X_BV, TURN, posture=place.posture)
+    arc = stances.best_arc(X_BA, TURN, posture=place.posture)
     if not arc.q:
         return math.nan, ""
     plant, index, limits = robot.model.plant, robot.model.robot, _limits(robot.model.plant)
     context = plant.CreateDefaultContext()
-    push = report.friction / 2 / stances.marker.handle_radius  # of each hand, across its radius [N]
     worst, joint, now = 0.0, "", dict(arc.q)
     for angle in np.linspace(0.0, TURN, SAMPLES):
-        X_BA = turned(X_BV, float(angle))
+        X_BAk = turned(X_BA, float(angle))
         positions = robot.rest(robot.opening)
         if place.posture is not None and len(place.posture):
             positions[robot.slots(robot.posture.names)] = place.posture
         for side in SIDES:
-            X_BG = compose(X_BA, hand_in_valve(side, arc.swapped, stances.marker))
+            X_BG = compose(X_BAk, stances.valve.grasp(arc.grasps[side].handle, arc.grasps[side].sign))
             q = robot.inverse(side, X_BG, now[side], place.posture)
             now[side] = now[side] if q is None else q
             positions[robot.slots(robot.arms[side].names)] = now[side]
         plant.SetPositions(context, positions)
         weight = plant.CalcGravityGeneralizedForces(context)
         for side in SIDES:
-            radius = robot.forward(side, now[side], place.posture)[:, 3] - X_BA[:, 3]
-            across = np.cross(-X_BA[:, 2], radius)
+            radius = robot.forward(side, now[side], place.posture)[:, 3] - X_BAk[:, 3]
+            across = np.cross(-X_BAk[:, 2], radius)
+            push = report.friction / 2 / float(np.linalg.norm(across))  # half the couple each [N]
             torque = robot.jacobian(side, now[side], place.posture)[3:].T @ (push * across / np.linalg.norm(across))
             for k, name in enumerate(robot.arms[side].names):
                 v = plant.GetJointByName(name, index).velocity_start()
@@ -596,11 +626,11 @@ def _pictures(
     head: StereoHead | None,
     eyes: Mapping[str, np.ndarray],
 ) -> None:
-    marker, d = scenario.marker, robot.description
+    d = robot.description
     valve, place = best if best is not None else (ValveConfig(), Place(np.array([-1.0, 0, 0])))
 
     def add(plant: MultibodyPlant) -> ModelInstanceIndex:
-        return add_scene(plant, valve, (marker.size[0], marker.size[1]), d, laboratory=False).robot
+        return add_scene(plant, valve, scenario.valve, d, laboratory=False).robot
 
     studio = Studio(add)
     arms = {side: arm.home for side, arm in robot.arms.items()}
@@ -617,16 +647,16 @@ def _pictures(
         report.pictures[f"{eye} eye, arms folded, a valve 2 m away"] = png(studio.view(X, _info(head, eye)))
     if best is None or not len(robot.base):
         return
-    X_WV = compose(panel_pose(valve), make(np.eye(3), np.array([0, 0, -marker.panel_depth])))
+    X_WA = compose(panel_pose(valve), inverse(scenario.valve.X_AP()))
     tried = dc.replace(scenario.stance, distance_min=NEAREST, distance_max=FARTHEST, distance_step=STEP)
-    stances = Stances(robot, marker, tried, _views(scenario), CollisionModel(robot, marker).is_free)
-    arc = stances.best_arc(compose(inverse(planar(*place.base)), X_WV), TURN, posture=place.posture)
+    stances = Stances(robot, scenario.valve, tried, _views(scenario), CollisionModel(robot).is_free)
+    arc = stances.best_arc(compose(inverse(planar(*place.base)), X_WA), TURN, posture=place.posture)
     torso = robot.torso.home.copy()
     if place.posture is not None:
         torso[: len(place.posture)] = place.posture
     studio.pose(robot.named(base=place.base, torso=torso, arms=arc.q, opening=robot.opening))
     box = np.array([[place.base[0] - 0.4, -0.6, 0.0], [0.1, 0.6, 1.6]])
-    report.pictures[f"at a valve {valve.height:g} m high"] = png(studio.around(box))
+    report.pictures[f"at a valve {valve.height:g} m high"] = png(studio.around(box, BEHIND))
 
 
 def _rest(report: Report, scenario: Scenario) -> None:

@@ -149,18 +149,11 @@ def _sections(report: Report) -> Iterator[str]:
         )
         yield f"<table><tr>{_cells(head, 'th')}</tr>{body}</table><br>"
     yield "<h2>Grippers</h2>"
-    head = (
-        "side",
-        "shuts to [mm]",
-        "opens to [mm]",
-        "used [mm]",
-        "room each side [mm]",
-        "its motor closes with up to [N]",
-    )
+    names = ("side", "shuts to [mm]", "opens to [mm]", "used [mm]", "room each side [mm]", "its motor closes with [N]")
     keys = ("shuts_m", 1e3), ("opens_m", 1e3), ("used_m", 1e3), ("room_m", 1e3), ("force_N", 1.0)
     rows = [(side, *(f"{scale * g[key]:.0f}" for key, scale in keys)) for side, g in report.grippers.items()]
     body = "".join(f"<tr>{_cells(row, 'td')}</tr>" for row in rows)
-    yield f"<table><tr>{_cells(head, 'th')}</tr>{body}</table>"
+    yield f"<table><tr>{_cells(names, 'th')}</tr>{body}</table>"
     yield "<h2>Servos of the simulated joints, at home</h2>"
     body = "".join(f"<tr>{_cells(row, 'td')}</tr>" for row in _servo_rows(report))
     yield f"<table><tr>{_cells(SERVO_HEAD, 'th')}</tr>{body}</table>"

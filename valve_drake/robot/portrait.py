@@ -1,6 +1,6 @@
 """Pictures of a robot as the cameras will see it: from ahead and from behind, through its eyes, at the valve."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -71,14 +71,14 @@ class Studio:
         image = query.RenderColorImage(ColorRenderCamera(core, False), self._scene_graph.world_frame_id(), X)
         return np.ascontiguousarray(image.data[:, :, 2::-1])
 
-    def around(self, box: np.ndarray) -> np.ndarray:
-        """Two views of what a box (2, 3) [m] holds, from ahead and from behind, beside each other."""
+    def around(self, box: np.ndarray, directions: Sequence[np.ndarray] = _VIEWS) -> np.ndarray:
+        """Views of what a box (2, 3) [m] holds, beside each other. directions: from it towards the cameras (3,)."""
         centre, radius = box.mean(axis=0), float(np.linalg.norm(np.ptp(box, axis=0))) / 2
         width, height = SIZE
         distance = 0.85 * radius / np.sin(FIELD / 2 * min(1.0, width / height))
         info = CameraInfo(width, height, FIELD)
         views = []
-        for view in _VIEWS:
+        for view in directions:
             z = -view / np.linalg.norm(view)
             x = np.cross(z, [0.0, 0.0, 1.0])
             x /= np.linalg.norm(x)

@@ -1,0 +1,223 @@
+"""check-robot: what it says of our robot, of robots that lack something, and of real ones of installed wheels."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+from robot_facts import ROBOT
+from robot_variants import part, put, variant
+
+from valve_drake import cli, robot_check, robot_check_page, yaml_file
+from valve_drake import scenario as scenarios
+from valve_drake.checks import ConfigError
+from valve_drake.robot import packages
+from valve_drake.robot_check import DOUBTFUL, MISSING, NOTE, Report
+
+FEW = (0.8, 1.0)  # heights: a whole table takes long
+
+
+@pytest.fixture(autouse=True)
+def few_rows(monkeypatch):
+    monkeypatch.setattr(robot_check, "HEIGHTS", FEW)
+    monkeypatch.setattr(robot_check, "TILTS", (0.0,))
+
+
+def checked(path, *overrides, **kwargs) -> Report:
+    scenario = scenarios.load(None, ["simulation.valve.height=1.0", *overrides])
+    scenario.robot = str(path)
+    return robot_check.check(scenario, str(path), **kwargs)
+
+
+def said(report, level):
+    return [f"{finding.stage} {finding.key}: {finding.text}" for finding in report.findings if finding.level == level]
+
+
+def test_our_robot_is_usable_and_its_table_is_that_of_the_stances(tmp_path, capsys):
+    page = tmp_path / "ours.html"
+    assert cli.main(["check-robot", "robot/robot.yaml", "--json", "--html", str(page)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["usable"] and not [f for f in found["findings"] if f["level"] != NOTE]
+    assert [row["joint"] for row in found["groups"]["left_arm"]] == list(ROBOT.arms["left"].names)
+    assert found["grippers"]["left"]["opens_m"] == pytest.approx(0.09, abs=1e-6) and found["grippers"]["left"][
+        "room_m"
+    ] == pytest.approx(0.03)
+    assert {row["height"] for row in found["reach"]} == {0.8, 0.81, 1.0, 1.22}
+    assert all(row["serves"] and row["margin"] > 0.5 and 0.1 < row["effort"] < 0.6 for row in found["reach"])
+    assert found["hidden_share"] == {"left": 0.0, "right": 0.0} and found["processor_s"] < 30
+    text = page.read_text()
+    assert robot_check_page.is_page(page) and text.count("data:image/png") == 4 and "left_arm_1" in text
+    assert cli.main(["check-robot", "robot/robot.yaml", "--html", str(page)]) == 0  # its own page may be replaced
+    assert "robot/robot.yaml: robot is usable" in capsys.readouterr().out
+
+
+def test_the_effort_of_a_turn_is_that_of_the_law_of_the_lever():
+    """With hands that weigh nothing, twice the friction asks twice the effort."""
+    weightless = {}
+    for friction in (5.0, 10.0):
+        report = checked("robot/robot.yaml", f"simulation.valve.friction={friction}")
+        weightless[friction] = next(row for row in report.reach if row.height == 1.0)
+        assert report.friction == friction
+    assert weightless[10.0].margin == weightless[5.0].margin
+    assert weightless[5.0].effort < weightless[10.0].effort < 2 * weightless[5.0].effort
+
+
+def at(path, value):
+    def change(given):
+        *inner, last = path.split(".")
+        for name in inner:
+            given = given[name]
+        given[last] = value
+
+    return change
+
+
+def weak(model):
+    put(part(model, "joint", "left_arm_3"), "axis/limit/effort", "6")
+
+
+def crossed(given):
+    for side, sign in (("left", -1), ("right", 1)):
+        given["arms"][side]["home"] = [0, sign * 1.57, 0, 0, 0, 0]
+
+
+def narrow(given):
+    given.update(opening=0.05, collision={"padding": 0.01})
+
+
+def off_the_hand(model):
+    part(model, "frame", "left_wrist_camera").set("attached_to", "left_forearm")
+
+
+LACKS = {
+    "no second eye": (None, at("head_calibration", ""), MISSING, "search head_calibration: none: there is no"),
+    "a calibration that is not there": (None, at("head_calibration", "h.yaml"), MISSING, "head_calibration: no such"),
+    "no tilt": (None, at("gaze.tilt", ""), MISSING, "search gaze.tilt: no joint turns the eyes up and down"),
+    "no wrist camera": (None, at("cameras.right_wrist", ""), MISSING, "servo cameras.right_wrist: no camera"),
+    "a camera on the forearm": (off_the_hand, None, MISSING, "left_wrist: left_forearm does not move with the hand"),
+    "nothing taught": (None, at("taught", ""), NOTE, "servo taught: none yet"),
+    "references of another opening": (None, at("opening", 0.08), DOUBTFUL, "servo taught: of an opening of 85 mm, not"),
+    "small hands": (None, at("opening", 0.03), MISSING, "grasp opening: the fingers open by 90 mm, from 0 to 90 mm"),
+    "narrow hands": (None, narrow, DOUBTFUL, "the hand must come within 12 mm of its middle"),
+    "arms too weak for their weight": (weak, None, MISSING, "reach counterbalanced: false, but the weight asks"),
+    "soft servos": (
+        None,
+        at("arms.left.stiffness", [100, 100, 60, 30, 20, 15]),
+        DOUBTFUL,
+        "reach arms.*.stiffness: ",
+    ),
+    "arms before the eyes": (
+        None,
+        at("arms.left.home", [-0.9, -0.4, 0, 0, 0, 0]),
+        MISSING,
+        "search arms.*.home: folded, the robot hides",
+    ),
+    "a home that touches": (
+        None,
+        crossed,
+        MISSING,
+        "reach arms.*.home: touches or is nearer than collision.padding",
+    ),
+    "a home in which the arms are in each other": (
+        None,
+        lambda given: (crossed(given), given.update(collision={"ignore": "touching_at_home"})),
+        DOUBTFUL,
+        "`collision` has it that they may touch",
+    ),
+    "a model that contradicts it": (None, at("gaze.pan", "neck"), MISSING, "load : gaze.pan must be a joint of"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", LACKS)
+def test_what_a_robot_lacks_is_said_with_its_key(case, tmp_path, monkeypatch):
+    monkeypatch.setattr(robot_check, "HEIGHTS", (1.0,))
+    edit, change, level, words = LACKS[case]
+    path = variant(tmp_path, edit or (lambda model: None), change or (lambda given: None))
+    report = checked(path)
+    assert any(words in line for line in said(report, level)), report.findings
+    assert report.usable == (level != MISSING)
+    assert all("\n" not in line for line in robot_check_page.lines(report))
+
+
+def test_a_valve_out_of_reach_is_refused_and_one_of_several_is_doubtful(capsys):
+    assert cli.main(["check-robot", "robot/robot.yaml", "--set", "simulation.valve.height=1.6"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith("not usable yet")
+    assert lines[1] == "missing: reach: the scenario's valve at 1.6 m is out of reach"  # what is missing comes first
+    report = checked("robot/robot.yaml", "simulation.valve.height=!Uniform {min: 0.9, max: 1.6}")
+    assert report.usable and "reach : the scenario's valve at 1.6 m is out of reach" in said(report, DOUBTFUL)
+
+
+def test_a_wrong_file_is_bad_input(tmp_path, capsys):
+    assert cli.main(["check-robot", str(tmp_path / "nobody.yaml")]) == 2
+    path = variant(tmp_path, change=at("opening", "wide"))
+    assert cli.main(["check-robot", str(path)]) == 2
+    said = capsys.readouterr()
+    assert "opening must be a finite number, got 'wide'" in said.err and not said.out
+    assert cli.main(["check-robot", "robot/robot.yaml", "--html", str(path)]) == 2  # a robot's file is no page of ours
+
+
+# ---------------------------------------------------------------- real robots
+
+TIAGO = "package://example-robot-data/robots/tiago_pro_description/robots/tiago_pro.urdf"
+BAXTER = "package://example-robot-data/robots/baxter_description/urdf/baxter.urdf"
+VEGA = "package://dexmate_urdf/robots/humanoid/vega_1/vega_1_gripper.urdf"
+# Of each draft: model, what it says, whether all that it says is missing, and where its hands reach.
+REAL = {
+    "tiago_pro": (
+        TIAGO,
+        [
+            (MISSING, "search head_calibration: none: there is no second eye"),
+            (MISSING, "servo cameras.left_wrist: no camera"),
+            (MISSING, "reach : the scenario's valve at 0.81 m is out of reach"),
+            (DOUBTFUL, "grasp grippers.left: its motor closes with"),
+            (NOTE, "grasp opening: the fingers open by 71 mm"),
+        ],
+        {0.81: False, 1.0: True, 1.2: True},
+    ),
+    "baxter": (
+        BAXTER,
+        [
+            (MISSING, "search gaze.tilt: no joint turns the eyes up and down"),
+            (MISSING, "approach base.drive: fixed"),
+            (DOUBTFUL, "grasp opening: the fingers open by 42 mm"),
+        ],
+        {0.81: False},
+    ),
+    "vega_1": (
+        VEGA,
+        [
+            (MISSING, "search head_calibration: none: there is no second eye"),
+            (MISSING, "opening must be at most command_selector.gripper_high"),
+            (DOUBTFUL, "grasp pad.at: open, the fingers' shapes are"),
+        ],
+        {0.81: False},
+    ),
+}
+
+
+@pytest.mark.robots
+@pytest.mark.parametrize("name", REAL)
+def test_real_robots_of_installed_wheels_are_imported_and_judged(name, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("trimesh")
+    model, wanted, reach = REAL[name]
+    try:
+        packages.resolve(model, None, "MODEL")
+    except ConfigError as error:
+        pytest.skip(str(error))
+    monkeypatch.setattr(robot_check, "HEIGHTS", tuple(reach))
+    assert cli.main(["import-robot", model, "-o", str(tmp_path / name)]) == 0
+    capsys.readouterr()
+    file = tmp_path / name / "robot.yaml"
+    start = time.process_time()
+    page = tmp_path / "page.html"
+    code = cli.main(["check-robot", str(file), "--set", "simulation.valve.height=0.81", "--json", "--html", str(page)])
+    assert code == 1 and time.process_time() - start < 60
+    found = json.loads(capsys.readouterr().out)
+    lines = [(f["level"], f"{f['stage']} {f['key']}: {f['text']}") for f in found["findings"]]
+    for level, words in wanted:
+        assert any(level == at and words in line for at, line in lines), lines
+    served = {row["height"]: row["serves"] for row in found["reach"]}
+    assert {height: served[height] for height in reach} == reach
+    assert page.read_text().count("data:image/png") >= 2
+    assert yaml_file.read(file)["model"].endswith(".urdf") and np.isfinite(found["processor_s"])
