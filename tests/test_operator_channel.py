@@ -412,6 +412,20 @@ def test_a_second_operator_is_refused_by_name_and_told_so_but_may_stop():
     assert bench.run(1.0).commands == ["open", "stop"]  # once
 
 
+def test_a_stop_of_anybody_forgets_what_waits_for_confirm():
+    for stop in ("other", "local"):
+        bench = Bench().run()
+        bench.desks.append(Desk(BOB))
+        bench.say("robot open")
+        if stop == "other":
+            bench.say("stop", desk=1)
+        else:
+            bench.local = OperatorCommand(sequence=1, command="stop")
+            bench.run()
+        bench.say("confirm")
+        assert bench.commands == ["stop"]
+
+
 def test_a_second_operators_confirm_does_not_confirm_the_firsts_move():
     bench = Bench().run()
     bench.desks.append(Desk(BOB))

@@ -178,7 +178,7 @@ class Desk:
             return styled("")
         color = {"done": "bold green", "failed": "bold red", "stopped": "bold yellow"}.get(state.mode, "bold")
         what = next((row.what for mode, row in TABLE.items() if mode == state.mode), "")
-        turned = f"  {state.turned:.0f} deg turned" if state.turned else ""
+        turned = f"  {abs(state.turned):.0f} deg turned" if state.turned else ""
         held = ("  HELD", "bold yellow") if state.held else ""
         return styled((f"{state.mode:<15}", color), state.reason or what, turned, held)
 

@@ -119,12 +119,13 @@ def step(
 
 
 def _give(s: State, command: str, angle: float = 0.0) -> State:
-    """A command for the supervisor. In one step a stop goes before all others."""
+    """A command for the supervisor. A stop goes before all others of its step, and forgets what waits for `confirm`."""
     if s.stopped or not command:
         return s
     given = OperatorCommand(sequence=s.command.sequence + 1, command=command, angle=angle)
-    stop = command == "stop"
-    return changed(s, command=given, stopped=stop, follows=None if stop else s.follows)
+    if command == "stop":
+        return changed(s, command=given, stopped=True, follows=None, talk=Talk())
+    return changed(s, command=given)
 
 
 def _answer(s: State, says: str, **shown: object) -> State:
@@ -244,7 +245,7 @@ def _busy(s: State, mode: ModeState) -> str:
 
 
 def _status(s: State, mode: ModeState) -> str:
-    turned = f", {s.shown.turned:.0f} degrees turned" if mode.mode == Mode.TURN else ""
+    turned = f", {abs(s.shown.turned):.0f} degrees turned" if mode.mode == Mode.TURN else ""
     held = ", held: say confirm to go on, or stop" if mode.held else ""
     reason = f", {mode.reason}" if mode.reason and not mode.held else ""
     return f"{mode.mode}{reason}{turned}{held}"
@@ -269,7 +270,8 @@ def seen(mode: ModeState, estimate: RectangleEstimate, marks: HandleMarks) -> st
     parts = []
     if mode.head_every:
         distance = math.sqrt(float(estimate.X_LV[:, 3] @ estimate.X_LV[:, 3]))
-        parts.append(f"marker at {distance:.2f} m" if estimate.found else f"no marker: {estimate.reason}")
+        why = f": {estimate.reason}" if estimate.reason else ""
+        parts.append(f"marker at {distance:.2f} m" if estimate.found else f"no marker{why}")
     if mode.wrist_every:
         found = [side for side in SIDES if getattr(marks, side).found]
         parts.append(f"green marks: {' and '.join(found) or 'none'}")
