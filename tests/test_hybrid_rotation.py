@@ -11,7 +11,7 @@ import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
 from robot_facts import ROBOT
 
-from valve_drake.behaviors import hybrid_rotation
+from valve_drake.behaviors import hybrid_rotation_turn
 from valve_drake.behaviors.closed_chain import contact_wrench, gravity_wrench, make_chain, turn_rate, twists
 from valve_drake.behaviors.hybrid_rotation import HybridRotation, Memory
 from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
@@ -267,7 +267,7 @@ def test_without_the_couple_in_the_relative_target_the_hands_yield_to_it(monkeyp
 
     It shows where hands are soft; stiffer ones get a part of the way.
     """
-    law = hybrid_rotation.twists
+    law = hybrid_rotation_turn.twists
 
     def naive(chain, rate, config, extra):
         return law(dc.replace(chain, torque=0.0), rate, config, extra)
@@ -276,7 +276,7 @@ def test_without_the_couple_in_the_relative_target_the_hands_yield_to_it(monkeyp
     soft.law.config = dc.replace(CONFIG, damping=2500.0, angular_damping=160.0)
     assert copy.deepcopy(soft).run(Mode.TURN, QUARTER).state == "succeeded"  # with the couple in it they do turn it
     bench = grasped()
-    monkeypatch.setattr(hybrid_rotation, "twists", naive)
+    monkeypatch.setattr(hybrid_rotation_turn, "twists", naive)
     assert bench.run(Mode.TURN, QUARTER).state == "failed"
     assert soft.run(Mode.TURN, QUARTER).state == "failed"
     assert np.degrees(soft.angle) < 5

@@ -1,0 +1,106 @@
+"""Stage 5, mode `turn`: both hands turn the valve; what ends it: the angle, a stall, a slip, the reach, a force."""
+
+import math
+
+import numpy as np
+
+from valve_drake.behaviors.closed_chain import (
+    Chain,
+    turn_rate,
+    twists,
+)
+from valve_drake.behaviors.hybrid_rotation_hands import Hands, Memory
+from valve_drake.memory import changed
+from valve_drake.messages import (
+    LEFT,
+    RIGHT,
+    ModeState,
+    RobotState,
+    Status,
+    Verdict,
+)
+
+
+class Turning(Hands):
+    """Mode `turn`."""
+
+    def _turn(
+        self, time: float, dt: float, m: Memory, state: RobotState, mode: ModeState, chain: Chain
+    ) -> tuple[Memory, np.ndarray, np.ndarray]:
+        c = self.config
+        gripper = np.array([0.0, c.grip_force])
+        asked = m.plan.turn
+        sense = 1.0 if asked >= 0 else -1.0
+        if m.stage in ("turn", "back"):
+            m = self._watch(time, dt, m, state, chain)
+        if m.stage not in ("turn", "back"):
+            return m, twists(chain, None, c, np.zeros(6)), gripper
+        if m.stage == "back":
+            sense = -sense
+        goal = asked if m.stage == "turn" else m.stalled_at + sense * c.back_off
+        left = sense * (goal - m.turned)
+        if m.stage == "turn" and left <= c.tolerance:
+            detail = f"{np.degrees(m.turned):.2f} deg by the hands"
+            status = Status(
+                time, m.activation, "succeeded", detail=detail, progress=1.0, value=m.plan.turned + m.turned
+            )
+            m = changed(m, stage="there", status=status)
+            return m, twists(chain, None, c, np.zeros(6)), gripper
+        lead = sense * (m.commanded - m.turned)
+        rate = turn_rate(left, m.rate, sense * chain.torque, lead, c, dt)
+        if mode.held:  # it slows down to rest; a stall is none
+            rate = min(rate, max(m.rate - c.rate / c.ramp * dt, 0.0))
+            m = changed(m, progress_at=(time, m.turned))
+        m = changed(m, rate=rate, commanded=m.commanded + sense * rate * dt)
+        progress = min(max((m.plan.turned + m.turned) / mode.turn_angle, 0.0), 1.0)
+        m = changed(m, status=Status(time, m.activation, "running", progress=progress, value=m.plan.turned + m.turned))
+        m = self._stall(time, m, sense, left)
+        return m, twists(chain, sense * rate, c, np.zeros(6)), gripper
+
+    def _stall(self, time: float, m: Memory, sense: float, left: float) -> Memory:
+        """After a stall it turns the other way: if that is free, the stall was an end stop, else the valve is stuck."""
+        c = self.config
+        since, angle = m.progress_at
+        if sense * (m.turned - angle) > c.stall_angle:
+            return changed(m, progress_at=(time, m.turned))
+        if m.stage == "back":
+            if left <= c.tolerance:  # free the other way: turn on
+                return changed(m, stage="turn", rate=0.0, progress_at=(time, m.turned), commanded=m.turned)
+            if time - since > c.stall_time:
+                detail = f"stiff both ways at {np.degrees(m.turned):.1f} deg, {m.telemetry.torque:.1f} N m"
+                return self._fail(time, m, Verdict.STUCK, detail)
+        elif time - since > c.stall_time:
+            if m.stalls > 0 and abs(m.turned - m.stalled_at) < np.radians(2):
+                detail = f"stopped twice at {np.degrees(m.turned):.1f} deg, free the other way"
+                return self._fail(time, m, Verdict.END_STOP, detail)
+            if m.stalls >= 3:
+                return self._fail(time, m, Verdict.STUCK, f"stalled {m.stalls + 1} times")
+            return changed(
+                m,
+                stage="back",
+                rate=0.0,
+                stalls=m.stalls + 1,
+                stalled_at=m.turned,
+                progress_at=(time, m.turned),
+                commanded=m.turned,
+            )
+        return m
+
+    def _watch(self, time: float, dt: float, m: Memory, state: RobotState, chain: Chain) -> Memory:
+        """Force trip, grasp lost, one hand carrying all, end of reach."""
+        c = self.config
+        force = [math.hypot(*f) for f in chain.f.tolist()]
+        m = changed(m, tripped=m.tripped + 1 if max(force) > c.force_trip else 0)
+        if m.tripped >= 3:
+            verdict = Verdict.STUCK if abs(chain.torque) > 0.7 * c.torque_limit else Verdict.FAULT
+            return self._fail(time, m, verdict, f"hand forces {force[0]:.0f} and {force[1]:.0f} N")
+        off = max(self._off(m, state)) > 2 * c.grip_margin
+        share = chain.couples[0] / chain.torque if abs(chain.torque) > 2.0 else chain.share
+        bad = off or not 0.2 * chain.share < share < 1 - 0.2 * (1 - chain.share)
+        m = changed(m, bad_grip_time=m.bad_grip_time + dt if bad else 0.0)
+        if m.bad_grip_time > 0.5:
+            detail = f"{self._openings(state)}, left hand carries {100 * share:.0f} %"
+            return self._fail(time, m, Verdict.SLIP, detail)
+        if min(self.robot.margin(LEFT, state.left_arm), self.robot.margin(RIGHT, state.right_arm)) < 0.02:
+            return self._fail(time, m, Verdict.REACH_LIMIT, f"arms at their limit at {np.degrees(m.turned):.1f} deg")
+        return m
