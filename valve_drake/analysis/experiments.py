@@ -559,6 +559,13 @@ def rendered(seed: int = 0, trials: int = 100) -> dict[str, Any]:
     return rendered_bound.rendered_bound(seed, trials)
 
 
+def voice(seed: int = 0, trials: int = 60) -> dict[str, Any]:
+    """See voice/experiment.py. trials: minutes of other speech."""
+    from valve_drake.voice import experiment
+
+    return experiment.run(seed, trials)
+
+
 EXPERIMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     "hand-eye": hand_eye_experiment.hand_eye,
     "table2": table2,
@@ -567,6 +574,7 @@ EXPERIMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     "bound_rendered": rendered,
     "robustness": robustness,
     "peers": peers,
+    "voice": voice,
 }
 
 

@@ -1,4 +1,4 @@
-"""`valve-drake experiment`: the paper's tables, the bound, robustness, the hand-eye calibration and tag detectors."""
+"""`valve-drake experiment`: the paper's tables, the bound, robustness, hand-eye calibration, tag detectors, voice."""
 
 import argparse
 import importlib.util
@@ -14,10 +14,17 @@ from valve_drake.console import console as make_console
 
 
 def add(commands: Subcommands) -> None:
-    p = commands.add_parser("experiment", help="the paper's tables, the bound, robustness, hand-eye, tag detectors")
-    p.add_argument("name", choices=("table2", "table3", "bound", "robustness", "hand-eye", "peers"))
+    p = commands.add_parser(
+        "experiment", help="the paper's tables, the bound, robustness, hand-eye, tag detectors, voice"
+    )
+    p.add_argument("name", choices=("table2", "table3", "bound", "robustness", "hand-eye", "peers", "voice"))
     p.add_argument("--seed", type=int, default=0)
-    p.add_argument("--trials", type=int, metavar="N", help="images a row (table2: runs of six poses)")
+    p.add_argument(
+        "--trials",
+        type=int,
+        metavar="N",
+        help="images a row (table2: runs of six poses; voice: minutes of other speech)",
+    )
     p.add_argument(
         "--images",
         choices=("drawn", "rendered"),

@@ -256,12 +256,12 @@ def step(m: Memory, p: np.ndarray) -> tuple[Memory, tuple[Heard, ...]]:
     stop = spike("stop")
     if stop >= STOP_SURE:
         out.append(Heard("stop", score(stop, STOP_SURE), begin, time * STEP))
-        said, quiet, deaf_stop = (), 0, DEAF
+        said, quiet, deaf_stop, p = (), 0, DEAF, _without(p, ["stop"])
     elif spike("confirm") > _EARLY and said:
         text, probability = best_sentence(np.stack(said), _confirms())
         if probability >= SENTENCE_SURE:
             out.append(Heard(text, score(probability, SENTENCE_SURE), begin, time * STEP))
-            said, quiet, deaf_confirm = (), 0, DEAF
+            said, quiet, deaf_confirm, p = (), 0, DEAF, _without(p, ["confirm"])
     if said and (quiet >= PAUSE or len(said) >= LONGEST):
         words = np.stack(said)
         heard = transcript(words)
