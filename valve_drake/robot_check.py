@@ -42,13 +42,11 @@ from valve_drake.valve.valve import turned
 HEIGHTS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3)  # of the valve's axis [m]
 TILTS = (-0.3, 0.0, 0.3)  # of the panel; positive leans away at its top [rad]
 TURN = math.pi / 2  # [rad]
-NEAREST, FARTHEST = 0.5, 1.2  # base to panel, that are tried [m]
 STEP, LIFT_STEP = 0.07, 0.15  # between two that are tried, and between two heights of a lift [m]
 ARC_STEP = 0.4  # of the turn [rad]
 ENOUGH = 0.6  # margin at which the search ends
 ROW = 6.0  # of processor time for one row of the table [s]
 BUDGET = 40.0  # of processor time for the table; what is left of it then is not searched [s]
-FRONT = 0.05  # least room between the base's front and the panel [m]
 DEAR = 1.0  # share of an effort limit that must not be passed
 HIDDEN, BLIND = 0.02, 0.25  # share of the middle of an eye's image that folded arms may hide: doubtful, useless
 ASIDE = 0.6  # of the pans that the eyes are tried at, to both sides [rad]
@@ -435,13 +433,7 @@ def _servos(report: Report, robot: Robot) -> None:
 
 def _reach(report: Report, robot: Robot, scenario: Scenario, collision: CollisionModel) -> Best | None:
     """Fills the table."""
-    spec = scenario.stance
-    nearest = max(NEAREST, robot.description.base.footprint[0] + FRONT)
-    tried = dc.replace(spec, distance_min=nearest, distance_max=FARTHEST, distance_step=STEP, margin_enough=ENOUGH)
-    tried = dc.replace(
-        tried, lift_step=max(LIFT_STEP, spec.lift_step), arc_step=max(ARC_STEP, spec.arc_step), aside=0.0
-    )
-    stances = Stances(robot, scenario.valve, tried, _views(scenario), collision.is_free)
+    spec, stances = scenario.stance, _stances(robot, scenario, collision)
     fixed = scenario.simulation.valve
     own = {round(value(fixed.height), 3) for value in (_least, _most)}
     rows = [(height, 0.0) for height in sorted({*HEIGHTS, *own})]
@@ -468,6 +460,14 @@ def _reach(report: Report, robot: Robot, scenario: Scenario, collision: Collisio
             best = margin, valve, place
     _judge_reach(report, spec, own)
     return None if best is None else best[1:]
+
+
+def _stances(robot: Robot, scenario: Scenario, collision: CollisionModel) -> Stances:
+    """The search of a run, with fewer places and angles."""
+    spec = scenario.stance
+    step, lift, arc = max(STEP, spec.distance_step), max(LIFT_STEP, spec.lift_step), max(ARC_STEP, spec.arc_step)
+    tried = dc.replace(spec, distance_step=step, lift_step=lift, arc_step=arc, aside=0.0, margin_enough=ENOUGH)
+    return Stances(robot, scenario.valve, tried, _views(scenario), collision.is_free)
 
 
 def _find(stances: Stances, X_WA: np.ndarray) -> tuple[Place, float]:
@@ -507,13 +507,6 @@ def _judge_reach(report: Report, spec: StanceConfig, own: set[float]) -> None:
         report.add(MISSING if len(lost) == len(own) else DOUBTFUL, "reach", "", text)
     elif out:
         report.add(NOTE, "reach", "", f"valves at {', '.join(f'{h:g}' for h in out)} m are out of reach")
-    far = [row.distance for row in good]
-    if min(far) < spec.distance_min - 0.05 or max(far) > spec.distance_max + 0.05:
-        text = (
-            f"it stands best {min(far):.2f} to {max(far):.2f} m from the panel, "
-            f"stance.distance_min and distance_max are {spec.distance_min:g} and {spec.distance_max:g}"
-        )
-        report.add(DOUBTFUL, "reach", "", text)
 
 
 def _effort(report: Report, robot: Robot, stances: Stances, X_BA: np.ndarray, place: Place) -> tuple[float, str]:
@@ -648,8 +641,7 @@ def _pictures(
     if best is None or not len(robot.base):
         return
     X_WA = compose(panel_pose(valve), inverse(scenario.valve.X_AP()))
-    tried = dc.replace(scenario.stance, distance_min=NEAREST, distance_max=FARTHEST, distance_step=STEP)
-    stances = Stances(robot, scenario.valve, tried, _views(scenario), CollisionModel(robot).is_free)
+    stances = _stances(robot, scenario, CollisionModel(robot))
     arc = stances.best_arc(compose(inverse(planar(*place.base)), X_WA), TURN, posture=place.posture)
     torso = robot.torso.home.copy()
     if place.posture is not None:
