@@ -217,7 +217,8 @@ def test_every_entry_into_a_mode_is_a_new_activation():
     "mode, verdict, cause, again, retries",
     [
         (Mode.MEASURE, "reach_limit", "stance", [Mode.FINE_APPROACH], 2),
-        (Mode.MEASURE, "marker_lost", "", [Mode.SEARCH], 2),
+        (Mode.MEASURE, "marker_lost", "", [Mode.FOLD, Mode.RETREAT, Mode.SEARCH], 2),
+        (Mode.ROUGH_APPROACH, "marker_lost", "", [Mode.SEARCH], 2),
         (Mode.SERVO, "marker_lost", "", [Mode.REACH], 2),
         (Mode.GRASP, "grasp_missed", "", [Mode.RELEASE, Mode.REACH], 2),
     ],
@@ -253,7 +254,15 @@ def test_attempt_counts_the_retries_of_a_mode():
 def test_a_marker_lost_on_the_way_is_searched_again(mode):
     bench = bring_to(mode)
     bench.tick(lambda s: {"valve_search": {"state": "failed", "verdict": "marker_lost", "detail": "not seen"}})
-    assert bench.state.mode == Mode.SEARCH and "not seen" in bench.state.reason
+    assert "not seen" in bench.state.reason
+    if mode != Mode.ROUGH_APPROACH:  # near the valve it backs off first: from there it may see the marker again
+        assert bench.state.mode == Mode.FOLD
+        bench.tick(succeed)
+        assert bench.state.mode == Mode.RETREAT
+        bench.tick(succeed)
+    assert bench.state.mode == Mode.SEARCH
+    state = bench.until_end(succeed)
+    assert (state.mode, state.verdict) == (Mode.DONE, Verdict.TURNED)
 
 
 @pytest.mark.parametrize("mode", [m for m in RUNNING if m not in WATCHED and m != Mode.SEARCH])
@@ -269,6 +278,7 @@ def test_elsewhere_valve_search_has_no_say(mode):
 @pytest.mark.parametrize("verdict", ["stuck", "end_stop", "slip"])
 def test_a_turn_that_fails_lets_go_looks_backs_off_and_keeps_its_verdict(verdict):
     bench = bring_to(Mode.TURN)
+    bench.state = dc.replace(bench.state, retried=("slip",) * CONFIG.retries["slip"])
     seen = {
         Mode.TURN: {"state": "failed", "verdict": verdict, "detail": "12 N m"},
         Mode.VERIFY: {"state": "failed", "verdict": "slip" if verdict == "stuck" else "stuck"},
@@ -300,6 +310,40 @@ def test_arms_at_their_limit_in_a_turn_let_go_and_take_hold_again():
     assert (bench.state.mode, bench.state.verdict) == (Mode.RELEASE, Verdict.NONE)
     bench.tick(lambda s: {OWNER[s.mode]: {"state": "succeeded"}})
     assert bench.state.mode == Mode.FOLD
+
+
+def test_a_grip_that_is_lost_lets_go_looks_and_grasps_again_and_only_so_often():
+    lost = {"state": "failed", "verdict": "slip", "detail": "left hand carries 0 %"}
+    half = {"state": "failed", "verdict": "reach_limit", "cause": "regrasp", "detail": "camera sees 45 deg"}
+
+    def so_often(times):
+        left = [times]
+
+        def each(s):
+            if s.mode == Mode.TURN and left[0] > 0:
+                return {OWNER[s.mode]: lost}
+            if s.mode == Mode.VERIFY and left[0] > 0:
+                left[0] -= 1
+                return {OWNER[s.mode]: half}
+            return {OWNER[s.mode]: {"state": "succeeded"}}
+
+        return each
+
+    for times in (1, 2):
+        bench = bring_to(Mode.TURN)
+        state = bench.until_end(so_often(times))
+        again = [Mode.RELEASE, Mode.FOLD, Mode.VERIFY, Mode.MEASURE, Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN]
+        first = bench.modes.index(Mode.TURN)
+        assert bench.modes[first + 1 : first + 1 + len(again)] == again
+        assert bench.modes.count(Mode.TURN) == times + 1
+        assert (state.mode, state.verdict) == (Mode.DONE, Verdict.TURNED)
+    bench = bring_to(Mode.TURN)
+    state = bench.until_end(
+        lambda s: {OWNER[s.mode]: {Mode.TURN: lost, Mode.VERIFY: half}.get(s.mode, {"state": "succeeded"})}
+    )
+    assert bench.modes.count(Mode.TURN) == 3
+    assert (state.mode, state.verdict) == (Mode.FAILED, Verdict.SLIP)
+    assert bench.modes[-5:] == [Mode.RELEASE, Mode.FOLD, Mode.VERIFY, Mode.RETREAT, Mode.FAILED]
 
 
 def test_a_run_that_fails_takes_no_other_grasp():

@@ -56,6 +56,7 @@ from valve_drake.scenario import (
 from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.hardware import AHEAD, RobotLink
+from valve_drake.stations.mishaps import InterruptingOperator
 from valve_drake.stations.replay import Recording
 from valve_drake.stations.reports import listed
 from valve_drake.task.modes import TERMINAL
@@ -350,11 +351,15 @@ def _advance(
     """go: advances the simulator to a time."""
     context = simulator.get_mutable_context()
     waits = system.operator_channel is not None  # for its operators
+    interrupting: InterruptingOperator | None = None
     if waits:
         command(system, context, OperatorCommand())
         deliver(system, context, OperatorPackets())
     else:
-        command(system, context, OperatorCommand(sequence=0, command=scenario.command, angle=scenario.angle))
+        first = OperatorCommand(sequence=0, command=scenario.command, angle=scenario.angle)
+        command(system, context, first)
+        if scenario.station == "simulated":
+            interrupting = InterruptingOperator(scenario.simulation.mishap, first)
     with profiling.advance():
         simulator.Initialize()
     port = system.supervisor.GetOutputPort("mode")
@@ -368,14 +373,17 @@ def _advance(
         show(Progress(mode, now, time.perf_counter() - begin))
         if link is not None:
             link.tell(mode.mode, mode.activation)
-        if mode.mode in TERMINAL and duration is None and (stopped or not waits):
+        if interrupting is not None and (said := interrupting.say(now, mode)) is not None:
+            command(system, context, said)
+        more = waits or (interrupting is not None and interrupting.waits)
+        if mode.mode in TERMINAL and duration is None and (stopped or not more):
             end = min(end, mode.since + (TAIL_DONE if mode.mode == Mode.DONE else TAIL))
         if now >= end:
             if link is not None:
                 link.leave()
             return mode
         if stop() and not stopped:
-            stopped = True
+            stopped, interrupting = True, None
             command(system, context, OperatorCommand(sequence=1, command="stop"))
         go(min(now + STEP, end))
 

@@ -116,6 +116,7 @@ def lights(config: LightConfig) -> list[LightParameter]:
 
 
 RENDERER = "cameras"  # its name in the rig's SceneGraph
+DARK = 0.02  # of an image's brightness, where the lamps are out
 BACKGROUND = (0.80, 0.85, 0.90)
 # Up to which distance the edges of the valve's visuals are measured, by name [m]: the marker's always, those of the
 # handles' marks by the wrist cameras alone (of the head cameras' images, from farther off, only their middles count).
@@ -179,7 +180,7 @@ class CameraRig:
         self._context = self._diagram.CreateDefaultContext()
         self._plant_context = self.plant.GetMyMutableContextFromRoot(self._context)
         self._query = scene_graph.get_query_output_port()
-        self._camera = camera
+        self._camera, self._light = camera, light
         gains = np.array([light.red_gain, 1.0, light.blue_gain])
         levels = np.clip(np.arange(256)[:, None] * gains, 0, 255)
         self._white_balance = np.rint(levels).astype(np.uint8)[None]  # (1, 256, 3), a table
@@ -225,6 +226,8 @@ class CameraRig:
     def frame(self, name: str, capture: "Capture") -> CameraFrame:
         """What the camera delivers: lens, blur, white balance, noise, JPEG and back."""
         image = self.optical(name, capture.q)
+        if 0 <= self._light.off_at <= capture.time < self._light.off_at + self._light.off_for:
+            image = cv2.convertScaleAbs(image, alpha=DARK)
         rng = np.random.Generator(np.random.SFC64([self._seed, self._names.index(name), capture.sequence]))
         start = int(rng.integers(len(self._noise) - image.size))
         noise = self._noise[start : start + image.size].reshape(image.shape)

@@ -114,6 +114,8 @@ class PlantSystem(PythonSystem):
         for name, value in start.items():
             self.plant.GetJointByName(name, self.robot).set_default_positions([value])
         stem = self.plant.GetJointByName("stem", self.valve)
+        self._valve = valve
+        self._friction = self.plant.GetJointActuatorByName(STEM, self.valve)
         stem.set_default_positions([valve.bar_angle + shape.sense * max(valve.position, 0.0)])
         still = builder.AddNamedSystem("valve_at_rest", ConstantVectorSource(np.zeros(2)))
         builder.Connect(still.get_output_port(), self.plant.get_desired_state_input_port(self.valve))
@@ -122,6 +124,7 @@ class PlantSystem(PythonSystem):
         self.diagram: Diagram = builder.Build()
         self.diagram.set_name("plant_with_servos")
 
+        self._stem = stem.position_start()
         joints = [self.plant.get_joint_actuator(i).joint() for i in self.plant.GetJointActuatorIndices(self.robot)]
         self.actuated = order = [joint.name() for joint in joints]
         fingers = [robot.grippers[side].joint for side in SIDES]
@@ -237,6 +240,14 @@ class PlantSystem(PythonSystem):
         for at, q, v in zip(self._base_at, pose, speed):
             desired[at], desired[n + at] = q, v
 
+    def _set_friction(self, x: np.ndarray) -> None:
+        """Of a valve that stiffens while it opens."""
+        valve = self._valve
+        if valve.friction_open >= 0 and not valve.seized:
+            way = min(abs(float(x[self._stem]) - valve.bar_angle) / valve.travel, 1.0)
+            friction = valve.friction + way * (valve.friction_open - valve.friction)
+            self._friction.set_effort_limit(max(friction, 1e-6))
+
     def _set_fingers(self, desired: np.ndarray, x: np.ndarray, grips: list[tuple[float, float]]) -> None:
         """The fingers in `desired`; x: now; grips: of each hand where its finger is sent and how far from where it is
         the servo may pull it [m]."""
@@ -292,6 +303,7 @@ class PlantSystem(PythonSystem):
         twist: tuple[float, float] = tuple(commands["base.twist_command"].tolist())
         grips = self._grips(x, commands)
         scratch.SetDiscreteState(x)
+        self._set_friction(x)
         self._fixed_feed_forward.GetMutableData()  # tells the Context that the memory of `_feed_forward` changes
         self._feed_forward[:] = self._gravity(self._inner)
         for k in range(STEPS):

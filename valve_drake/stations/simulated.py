@@ -12,8 +12,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import AffineSystem, Demultiplexer
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.primitives import AffineSystem, Demultiplexer, MatrixGain
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from valve_drake.camera.lens import Lens, StereoHead
@@ -25,9 +25,10 @@ from valve_drake.robot.robot import Robot
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, TRUTH, check_contract
+from valve_drake.stations.mishaps import LostGripSystem, WheelSlipSystem, slips
 from valve_drake.stations.plant_system import COMMANDS, STEM, PlantSystem
 from valve_drake.stations.scene import add_scene, panel_pose, start_pose
-from valve_drake.stations.simulation_config import ErrorConfig, SimulationConfig, ValveConfig
+from valve_drake.stations.simulation_config import ErrorConfig, MishapConfig, SimulationConfig, ValveConfig
 from valve_drake.valve.model import marker_frame
 from valve_drake.valve.valve import Valve
 
@@ -69,8 +70,8 @@ class OdometrySystem(Block[OdometryInputs, tuple[np.ndarray, int]]):
 
     OUTPUTS = {"odometry": 5}
 
-    def __init__(self, error: ErrorConfig, seed: int):
-        self._error = error
+    def __init__(self, error: ErrorConfig, seed: int, mishap: MishapConfig | None = None):
+        self._error, self._mishap = error, mishap or MishapConfig()
         self._noise = _Noise(seed, 1, 2)
         self._scale = (1 + error.odometry_scale * _rng(seed, 0).standard_normal(2)).tolist()
         super().__init__("odometry", slot=3)
@@ -85,6 +86,8 @@ class OdometrySystem(Block[OdometryInputs, tuple[np.ndarray, int]]):
         x, y, h, _, _ = last.tolist()
         _, _, heading, vx, vy, w = inputs.base.tolist()
         forward = vx * math.cos(heading) + vy * math.sin(heading)
+        turning = 1.0 - slips(self._mishap, time)  # of the wheels' way, what the base has made
+        forward, w = (forward / turning, w / turning) if turning > 0 else (0.0, 0.0)
         draw, noise = self._noise(count).tolist(), self._error.odometry_noise
         forward = forward * self._scale[0] * (1 + noise * draw[0])
         w = w * self._scale[1] * (1 + noise * draw[1])
@@ -301,6 +304,29 @@ def make_plant(
     return PlantSystem(valve, shape, at_start, offsets, robot)
 
 
+def _mishaps(
+    builder: DiagramBuilder, simulation: SimulationConfig, physics: PlantSystem, now: OutputPort, robot: Robot
+) -> dict[str, InputPort]:
+    """Puts the mishaps before the plant -> the inputs that commands go to instead of the plant's, by name."""
+    mishap, out = simulation.mishap, {}
+    if mishap.grip_lost_at >= 0:
+        lost = builder.AddSystem(LostGripSystem(mishap, simulation.valve.bar_angle, robot))
+        stem = np.zeros((1, physics.size))
+        stem[0, physics.plant.GetJointByName("stem", physics.valve).position_start()] = 1.0
+        angle = builder.AddNamedSystem("stem_angle", MatrixGain(stem))
+        builder.Connect(now, angle.get_input_port())
+        builder.Connect(angle.get_output_port(), lost.GetInputPort("angle"))
+        for port, command in (("position", "position_command"), ("force", "force_limit")):
+            name = f"{mishap.grip_lost_hand}_gripper.{command}"
+            builder.Connect(lost.GetOutputPort(command), physics.GetInputPort(name))
+            out[name] = lost.GetInputPort(port)
+    if mishap.wheel_slip_at >= 0:
+        slip = builder.AddSystem(WheelSlipSystem(mishap))
+        builder.Connect(slip.GetOutputPort("twist_command"), physics.GetInputPort("base.twist_command"))
+        out["base.twist_command"] = slip.GetInputPort("twist")
+    return out
+
+
 def make_simulated_station(
     simulation: SimulationConfig,
     shape: Valve,
@@ -321,9 +347,10 @@ def make_simulated_station(
     offsets = arm_offsets(simulation.error, seed, robot)
     physics = builder.AddSystem(make_plant(simulation, shape, robot, seed) if physics is None else physics)
     plant, now = physics.plant, physics.GetOutputPort("now")
-    for name in COMMANDS:
-        builder.ExportInput(physics.GetInputPort(name), name)
     part = _demultiplexed(builder, "plant_parts", now, physics.parts)
+    done = _mishaps(builder, simulation, physics, now, robot)
+    for name in COMMANDS:
+        builder.ExportInput(done.get(name, physics.GetInputPort(name)), name)
     measured: dict[str, tuple[np.ndarray, np.ndarray | float]] = {
         POSITIONS: (np.eye(plant.num_positions(), physics.size), 0.0),
         BASE: (np.vstack([_select(physics, robot.base.names, what) for what in ("position", "velocity")]), 0.0),
@@ -340,7 +367,7 @@ def make_simulated_station(
     for name in measured.keys() - {POSITIONS, BASE}:
         builder.ExportOutput(ports[name], name)
 
-    odometry = builder.AddSystem(OdometrySystem(simulation.error, seed))
+    odometry = builder.AddSystem(OdometrySystem(simulation.error, seed, simulation.mishap))
     builder.Connect(ports[BASE], odometry.GetInputPort("base"))
     builder.ExportOutput(odometry.GetOutputPort("odometry"), "base.odometry")
 

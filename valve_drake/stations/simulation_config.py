@@ -5,6 +5,7 @@ import math
 
 from valve_drake.checks import require
 from valve_drake.config import Config, Number, choice, number, numbers, plain
+from valve_drake.messages import SIDES
 from valve_drake.ports import TICK
 
 
@@ -22,6 +23,9 @@ class ValveConfig(Config):
         0.0, -0.8, 0.8, "of the bar with the valve closed, from level, counter-clockwise for the robot [rad]"
     )
     friction: Number = number(5.1, 0.0, 30.0, "Coulomb, break-away and running [N m]")
+    friction_open: Number = number(
+        -1.0, -1.0, 30.0, "the same where it is open, rising evenly with the angle; -1: as closed [N m]"
+    )
     travel: float = number(1.5708, 0.1, 20.0, "between the end stops [rad]")
     stop_play: float = number(0.035, 0.0, 0.5, "how far beyond closed and open the stops are [rad]")
     position: Number = number(
@@ -53,6 +57,8 @@ class LightConfig(Config):
     intensity: Number = number(1.0, 0.1, 3.0, "of the lamps")
     azimuth: Number = number(0.6, -math.pi, math.pi, "of the main lamp [rad]")
     fill: float = number(0.0, 0.0, 1.0, "two more lamps of this intensity, for pictures")
+    off_at: Number = number(-1.0, -1.0, 600.0, "the lamps go out, and with them all light; -1: never [s]")
+    off_for: float = number(3.0, 0.1, 60.0, "for so long [s]")
     red_gain: Number = number(1.0, 0.3, 2.0, "white balance")
     blue_gain: Number = number(1.0, 0.3, 2.0, "white balance")
 
@@ -103,6 +109,21 @@ class ErrorConfig(Config):
 
 
 @dc.dataclass
+class MishapConfig(Config):
+    """What goes wrong in the middle of a run. -1: it does not."""
+
+    KEY = "simulation.mishap"
+    grip_lost_at: Number = number(-1.0, -1.0, 20.0, "the valve is so far from closed when a hand lets go [rad]")
+    grip_lost_for: float = number(1.5, 0.1, 60.0, "until it obeys again [s]")
+    grip_lost_hand: str = choice("left", SIDES, "that lets go")
+    wheel_slip_at: Number = number(-1.0, -1.0, 600.0, "the base does not go as its wheels turn [s]")
+    wheel_slip_for: float = number(1.0, 0.1, 60.0, "[s]")
+    wheel_slip_share: float = number(0.5, 0.0, 0.9, "of their way that is lost")
+    operator_stop_at: Number = number(-1.0, -1.0, 600.0, "the operator stops the run [s]")
+    operator_go_after: float = number(3.0, 0.5, 60.0, "it has stopped, the operator gives the command again [s]")
+
+
+@dc.dataclass
 class SimulationConfig(Config):
     """Scenario key `simulation`."""
 
@@ -112,3 +133,4 @@ class SimulationConfig(Config):
     light: LightConfig = dc.field(default_factory=LightConfig)
     camera: CameraConfig = dc.field(default_factory=CameraConfig)
     error: ErrorConfig = dc.field(default_factory=ErrorConfig)
+    mishap: MishapConfig = dc.field(default_factory=MishapConfig)

@@ -11,7 +11,8 @@ One block owns each mode: its Status, carrying this activation's number, ends it
                                                    elsewhere at once, the robot held still
 
 A run that was stopped near the valve leaves the robot there. The next one begins with fold -> retreat -> search: from
-close by the marker may be out of the cameras' view, and the arms may be out.
+close by the marker may be out of the cameras' view, and the arms may be out. A marker that is lost near the valve is
+searched in the same way.
 
 In grasp and turn the operator may `hold`: the turn stands still, the grasp is kept and no deadline runs, until `resume`
 or, after hold_time, a stop.
@@ -295,8 +296,10 @@ def _fail(config: SupervisorConfig, s: State, time: float, block: str, status: S
     retry = TABLE[s.mode].retry_of(status.cause, verdict)
     if retry is None or s.verdict or s.retried.count(retry.limit) >= config.retries[retry.limit]:
         return _give_up(s, time, verdict, reason)
-    after = retry.after_release or Mode.FOLD
-    return _enter(s, time, retry.mode, reason, retried=(*s.retried, retry.limit), after_release=after)
+    s = changed(s, retried=(*s.retried, retry.limit))
+    if retry.mode == Mode.SEARCH and s.near:  # from close by the marker may be out of the cameras' view
+        return _enter(s, time, Mode.FOLD, reason, clearing=True)
+    return _enter(s, time, retry.mode, reason, after_release=retry.after_release or Mode.FOLD)
 
 
 def _give_up(s: State, time: float, verdict: Verdict, reason: str) -> State:

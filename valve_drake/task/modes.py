@@ -185,7 +185,10 @@ ROWS = (
         deadline=60.0,
         contact=True,
         head_every=16,
-        retry={Verdict.REACH_LIMIT: Retry("turn", 3, Mode.RELEASE, after_release=Mode.FOLD)},
+        retry={  # the camera looks how far it is, and both hands grasp afresh
+            Verdict.REACH_LIMIT: Retry("turn", 3, Mode.RELEASE, after_release=Mode.FOLD),
+            Verdict.SLIP: Retry("slip", 2, Mode.RELEASE, after_release=Mode.FOLD),
+        },
         off=Mode.RELEASE,
     ),
     Row(

@@ -1,0 +1,130 @@
+"""What goes wrong in the middle of a run, each at its time and for its time (scenario key simulation.mishap)."""
+
+import dataclasses as dc
+
+import numpy as np
+import pytest
+from hands_at_valve import SHUT, VALVE, Hands, at_handle
+from pydrake.systems.analysis import Simulator
+from robot_facts import ROBOT
+from test_station import NEAR, PERFECT, Rig
+
+from valve_drake import resources
+from valve_drake import scenario as scenarios
+from valve_drake.checks import ConfigError
+from valve_drake.messages import LEFT, RIGHT, SIDES, ModeState, OperatorCommand
+from valve_drake.stations.mishaps import OPENING_FORCE, InterruptingOperator, LostGripSystem
+from valve_drake.stations.simulation_config import MishapConfig
+
+LEVELS = sorted((resources.diagrams() / "levels").glob("level5_*.scenario.yaml"))
+
+
+def test_a_valve_stiffens_evenly_from_closed_to_open():
+    valve = dc.replace(VALVE, friction=2.0, friction_open=12.0, travel=1.0)
+    hands = Hands(at_handle(LEFT), at_handle(RIGHT), valve=valve)
+    hands.command(SHUT)
+    hands.run(0.5)
+    for angle in (0.1, 0.2):
+
+        def follow(share, angle=angle):
+            for side in SIDES:
+                hands.arms[side] = at_handle(side, angle - 0.1 + share * 0.1, near=hands.arms[side])
+            return {f"{side}_arm.position_command": q for side, q in hands.arms.items()}
+
+        hands.run(1.0, follow)
+        turned = hands.kept[-1][1]
+        now = hands.plant.GetOutputPort("now").Eval(hands.context)
+        torque = abs(now[hands.plant.parts["stem"]][2])
+        assert turned == pytest.approx(angle, abs=0.03)
+        assert torque == pytest.approx(2.0 + 10.0 * turned, abs=0.3)
+
+
+def test_a_hand_lets_go_when_the_valve_has_turned_so_far_and_obeys_again():
+    system = LostGripSystem(MishapConfig(grip_lost_at=0.5, grip_lost_for=0.25), 0.1, ROBOT)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    for name, value in (("angle", 0.1), ("position", 0.0), ("force", 70.0)):
+        system.GetInputPort(name).FixValue(context, [value])
+
+    def does(until):
+        simulator.AdvanceTo(until)
+        return [system.GetOutputPort(name).Eval(context)[0] for name in ("position_command", "force_limit")]
+
+    assert does(0.5) == [0.0, 70.0]
+    system.GetInputPort("angle").FixValue(context, [-0.41])  # in either sense
+    assert does(0.6) == [ROBOT.opening, OPENING_FORCE]
+    assert does(0.7) == [ROBOT.opening, OPENING_FORCE]
+    assert does(0.9) == [0.0, 70.0]
+    system.GetInputPort("angle").FixValue(context, [0.1])
+    simulator.AdvanceTo(1.0)
+    system.GetInputPort("angle").FixValue(context, [0.7])  # once is enough
+    assert does(1.2) == [0.0, 70.0]
+
+
+def test_the_station_puts_a_lost_grip_between_the_command_and_the_hand():
+    rig = Rig(["simulation.mishap.grip_lost_at=0.0", "simulation.mishap.grip_lost_for=0.5"])
+    rig.set("left_gripper.position_command", np.array([0.03]))
+    rig.set("right_gripper.position_command", np.array([0.03]))
+    rig.run(0.45)
+    assert rig.read("left_gripper.position_measured")[0] > 0.08
+    assert rig.read("right_gripper.position_measured")[0] == pytest.approx(0.03, abs=2e-3)
+    rig.run(1.5)
+    assert rig.read("left_gripper.position_measured")[0] == pytest.approx(0.03, abs=2e-3)
+
+
+def test_wheels_that_slip_take_the_base_less_far_than_odometry_says():
+    slip = ["wheel_slip_at=0.5", "wheel_slip_for=0.5", "wheel_slip_share=0.8"]
+    rig = Rig([*(f"simulation.mishap.{key}" for key in slip), "simulation.start.distance=3.0"])
+    start = rig.read("truth.base_pose")[:2].copy()
+    rig.set("base.twist_command", np.array([0.4, 0.0]))
+    rig.run(1.5)
+    driven = np.linalg.norm(rig.read("truth.base_pose")[:2] - start)
+    believed = rig.read("base.odometry")[0]
+    assert believed - driven == pytest.approx(0.8 * 0.5 * 0.4, abs=0.02)
+
+
+def test_the_cameras_see_nothing_while_the_lamps_are_out():
+    rig = Rig(["simulation.light.off_at=0.5", "simulation.light.off_for=0.5"])
+    bright = [rig.run(time).read("head_left.image").image.mean() for time in (0.4, 0.9, 1.4)]
+    assert bright[1] < 10 < 50 < min(bright[0], bright[2])
+
+
+def test_an_operator_stops_the_run_and_gives_the_command_again():
+    go = OperatorCommand(sequence=0, command="open", angle=1.2)
+    operator = InterruptingOperator(MishapConfig(operator_stop_at=10.0, operator_go_after=3.0), go)
+    assert operator.say(9.9, ModeState(mode="turn")) is None and operator.waits
+    said = [operator.say(10.0, ModeState(mode="turn"))]
+    assert operator.say(12.0, ModeState(mode="release")) is None
+    assert operator.say(14.0, ModeState(mode="stopped", since=13.0)) is None
+    said += [operator.say(16.0, ModeState(mode="stopped", since=13.0)), operator.say(16.1, ModeState(mode="idle"))]
+    assert [(s.command, s.angle) for s in said] == [("stop", 1.2), ("reset", 1.2), ("open", 1.2)]
+    assert len({0, 1, *(s.sequence for s in said)}) == 5  # new ones, and none that the user's own stop has
+    assert not operator.waits and operator.say(99.0, ModeState(mode="done")) is None
+
+
+def test_an_operator_who_would_stop_a_run_that_is_over_says_nothing():
+    operator = InterruptingOperator(MishapConfig(operator_stop_at=10.0), OperatorCommand(command="open", angle=1.2))
+    assert operator.say(9.0, ModeState(mode="done", since=8.5)) is None
+    assert not operator.waits and operator.say(10.0, ModeState(mode="done", since=8.5)) is None
+
+
+def test_without_mishaps_the_station_has_no_system_for_them():
+    station = Rig().station
+    assert not {"lost_grip", "wheel_slip"} & {system.get_name() for system in station.GetSystems()}
+
+
+@pytest.mark.parametrize("path", LEVELS, ids=lambda path: path.name.split(".")[0])
+def test_level_5_is_a_mishap_in_todays_work(path):
+    plain = scenarios.resolve(scenarios.load("simulated.scenario.yaml", ["seed=3"]))
+    given = scenarios.resolve(scenarios.load(str(path), ["seed=3"]))
+    given.check()
+    ours, theirs = vars(given.simulation), vars(plain.simulation)
+    changed = {key for key in ours if ours[key] != theirs[key]}
+    assert changed and changed <= {"valve", "mishap", "light"}
+    assert given.angle == plain.angle and given.supervisor == plain.supervisor
+
+
+def test_a_mishap_out_of_its_bounds_is_refused_by_its_key():
+    with pytest.raises(ConfigError, match="simulation.mishap.wheel_slip_share"):
+        scenarios.load(None, ["simulation.mishap.wheel_slip_share=1.0"])
+    assert len(LEVELS) >= 8 and PERFECT and NEAR
