@@ -572,7 +572,7 @@ def test_block_clones_are_independent():
 
 def test_block_refuses_a_wrong_message_and_a_wrong_config():
     with pytest.raises(TypeError, match="want Command"):
-        rig(image_servo=ModeState()).run(0.1)
+        rig(mode=ModeState(mode="servo", activation=1), image_servo=ModeState()).run(0.1)
     with pytest.raises(ConfigError, match="initial"):
         CommandSelectorSystem(CONFIG, {}, ROBOT.torso, ROBOT.arms)
 

@@ -225,6 +225,10 @@ class CameraRig:
 
     def frame(self, name: str, capture: "Capture") -> CameraFrame:
         """What the camera delivers: lens, blur, white balance, noise, JPEG and back."""
+        return decoded(self.exposed(name, capture))
+
+    def exposed(self, name: str, capture: "Capture") -> CameraFrame:
+        """The same as it goes over a wire: JPEG alone."""
         image = self.optical(name, capture.q)
         if 0 <= self._light.off_at <= capture.time < self._light.off_at + self._light.off_for:
             image = cv2.convertScaleAbs(image, alpha=DARK)
@@ -232,7 +236,7 @@ class CameraRig:
         start = int(rng.integers(len(self._noise) - image.size))
         noise = self._noise[start : start + image.size].reshape(image.shape)
         image = cv2.add(cv2.LUT(image, self._white_balance), noise, dtype=cv2.CV_8U)  # saturates
-        return encode_frame(name, capture.time, capture.sequence, image, self._camera.jpeg_quality)
+        return CameraFrame(name, capture.time, capture.sequence, data=_jpeg(image, self._camera.jpeg_quality))
 
     def marker_pose(self, name: str, q: np.ndarray) -> np.ndarray:
         """X_CV: where one camera truly has the marker (3, 4)."""
@@ -261,15 +265,24 @@ def _noise_pool(seed: int, deviation: float) -> np.ndarray:
 
 
 def encode_frame(camera: str, time: float, sequence: int, image: np.ndarray, quality: int) -> CameraFrame:
-    """JPEG (without chroma subsampling, which would smear red edges) and back, as a camera on a wire does."""
+    """JPEG and back, as a camera on a wire does."""
+    return decoded(CameraFrame(camera, time, sequence, data=_jpeg(image, quality)))
+
+
+def decoded(frame: CameraFrame) -> CameraFrame:
+    """A frame with the image of its JPEG. Raises ValueError as `decode_image`."""
+    return dc.replace(frame, image=decode_image(frame.data))
+
+
+def _jpeg(image: np.ndarray, quality: int) -> bytes:
+    """Without chroma subsampling, which would smear red edges."""
     flags = [
         cv2.IMWRITE_JPEG_QUALITY,
         quality,
         cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
         cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
     ]
-    data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), flags)[1].tobytes()
-    return CameraFrame(camera=camera, time=time, sequence=sequence, image=decode_image(data), data=data)
+    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), flags)[1].tobytes()
 
 
 def decode_image(data: bytes) -> np.ndarray:

@@ -28,7 +28,7 @@ from valve_drake.beside import can_fork, fork
 from valve_drake.checks import OperationFailed
 from valve_drake.messages import CameraFrame
 from valve_drake.stations import render_egl
-from valve_drake.stations.camera_rig import CameraRig, Capture
+from valve_drake.stations.camera_rig import CameraRig, Capture, decoded
 from valve_drake.stations.contract import CAMERAS, HEAD, MATE, WRISTS
 
 WORKERS = 2
@@ -116,6 +116,8 @@ class CameraWorkers:
         last, stride = self._read.get(name, (capture.sequence, 0))
         self._read[name] = (capture.sequence, capture.sequence - last if capture.sequence > last else stride)
         frame = self._made[name, capture.sequence]
+        if frame.image.size == 0:  # decoded where it is looked at: pixels cost more on their way than a JPEG
+            frame = self._made[name, capture.sequence] = decoded(frame)
         for sequence in [s for s in self._asked[name] if s < capture.sequence and (name, s) in self._made]:
             del self._asked[name][sequence], self._made[name, sequence]
         return frame
@@ -219,7 +221,7 @@ def serve(fd: int, niceness: int, rig: CameraRig | None = None) -> None:
         start_up = time.process_time()
         while True:
             name, capture = _recv(wire)
-            frame = rig.frame(name, capture)
+            frame = rig.exposed(name, capture)
             _send(wire, (frame, start_up, time.process_time() - start_up))
     except (EOFError, ConnectionError):
         pass
