@@ -351,6 +351,12 @@ def test_failures_are_a_list_that_is_run_again(tmp_path, edge, monkeypatch, caps
     assert cli.main(["campaign", "--again", "hunt/failures.yaml", "--runs", "2", "--out", "mended", "--json"]) == 0
 
 
+def test_the_list_that_ci_repeats_can_be_run(tmp_path):
+    entries = failures.read(Path(__file__).with_name("failures.yaml"))
+    assert len(entries) >= 2
+    campaign.Campaign(("again",), 1, 1, (), tmp_path, again=entries).check()
+
+
 @pytest.mark.parametrize(
     "text, words",
     [

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from hands_at_valve import BASE, OUTWARD, SHUT, VALVE, Hands, at_handle
+from pydrake.systems.analysis import Simulator
 from robot_facts import GROUPS, ROBOT
 
 from valve_drake import diagram
@@ -128,6 +129,39 @@ def test_two_touches_of_one_pair_are_two_collisions_unless_they_are_close(tmp_pa
         ("c, d", 1.125, 0.0625, 10.0),
         ("a, b", 2.0, 0.0625, 5.0),
     ]
+
+
+def test_a_hand_that_closes_on_nothing_collides_with_nothing(tmp_path):
+    hands = Hands(home(LEFT), home(RIGHT))
+    hands.command(SHUT)
+    found = hands.run(1.5).summary(tmp_path / "run.mcap")
+    assert (found.collisions, found.peak_internal_force_N) == (0, 0.0)
+
+
+@pytest.mark.parametrize("name", ["simulated.scenario.yaml", "pr2.scenario.yaml"])
+def test_any_robots_hands_hold_by_the_pads_that_its_file_names(name):
+    scenario = scenarios.resolve(scenarios.load(name, ["seed=1", "simulation.start.at_valve=true"]))
+    station = diagram.make_station(scenario)
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    for port, value in diagram.initial_commands(scenario).items():
+        station.GetInputPort(port).FixValue(context, value)
+    simulator.Initialize()
+    for group in ("torso", *(f"{side}_arm" for side in SIDES)):
+        here = station.GetOutputPort(f"{group}.position_measured").Eval(context)
+        station.GetInputPort(f"{group}.position_command").FixValue(context, here)
+
+    def grip(opening, until):
+        for side in SIDES:
+            station.GetInputPort(f"{side}_gripper.position_command").FixValue(context, [opening])
+            station.GetInputPort(f"{side}_gripper.force_limit").FixValue(context, [60.0])
+        simulator.AdvanceTo(until)
+        return station.GetOutputPort(CONTACTS).Eval(context)
+
+    found = grip(0.0, 0.75)
+    assert min(found.left_pads.min(), found.right_pads.min()) > 10 and found.touching == ()
+    found = grip(0.08, 1.5)
+    assert not found.left_pads.any() and not found.right_pads.any() and found.touching == ()
 
 
 # ---------------------------------------------------------------- who may know

@@ -1,7 +1,7 @@
 """What touches what in the simulated plant: whether both pads of a hand hold the valve, and what touches besides.
 
 A hand holds by its pads (`grippers.SIDE.pads` of robot.yaml) on the valve's moving part. Its other fingers may touch
-that part, too: they neither hold nor collide. Every other contact of the robot is a collision, also one with itself.
+that part, too, and fingers each other: they neither hold nor collide. Every other contact of the robot is a collision, also one with itself.
 """
 
 from collections.abc import Iterable
@@ -122,6 +122,7 @@ class ContactReader:
         first, second = sorted((a, b), key=rank)
         place = self._place.get(first, _NOWHERE) if second in self._wheel else _NOWHERE
         meant = place < _ARM or (place != _NOWHERE and first in self._fingers)
+        meant |= {first, second} <= self._fingers  # of a hand that closes on nothing
         collision = None if meant or first not in self._ours else (first, second)
         kind = self._kinds[a, b] = (place, 1.0 if first == a else -1.0, collision)
         return kind
