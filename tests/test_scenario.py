@@ -97,6 +97,14 @@ def test_a_name_that_no_scenario_has_gives_one_short_line(name):
     assert str(caught.value).startswith("no such file: ") and len(str(caught.value)) < 300
 
 
+def test_a_log_from_before_the_valve_was_one_value_keeps_its_markers_size():
+    unknown = []
+    old = mut.parse("marker: {size: [0.12, 0.08], handle_radius: 0.15}\nangle: 0.5\n", "a log", unknown=unknown)
+    assert (old.valve.marker.size, old.angle, unknown) == ([0.12, 0.08], 0.5, [])
+    with pytest.raises(ConfigError, match="unknown key marker"):
+        mut.parse("marker: {size: [0.12, 0.08]}", "a scenario")
+
+
 def test_loading_twice_shares_nothing():
     a, b = mut.load(), mut.load()
     a.valve.marker.size[0] = 0.05

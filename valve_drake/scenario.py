@@ -184,7 +184,18 @@ def parse(text: str, source: str, defaults: Scenario | None = None, unknown: lis
     """
     scenario = Scenario() if defaults is None else defaults
     given = yaml_file.parse(text, source, TAGS)
+    if unknown is not None and isinstance(given, dict):
+        given = _of_today(given)
     return config.build(scenario, {} if given is None else given, source, unknown)
+
+
+def _of_today(given: dict[str, Any]) -> dict[str, Any]:
+    """A log's scenario from when the marker stood on its own: its size, the one key of it that could be changed."""
+    marker = given.get("marker")
+    if "valve" in given or not isinstance(marker, dict) or "size" not in marker:
+        return given
+    rest = {name: value for name, value in given.items() if name != "marker"}
+    return rest | {"valve": {"marker": {"size": marker["size"]}}}
 
 
 def dump(scenario: Scenario) -> str:
