@@ -230,3 +230,18 @@ def test_a_redundant_arm_that_is_not_comfortable_begins_from_other_postures_too(
     angles = np.linspace(0, np.pi / 2, 7)
     first = [min(search._follow(X_BA, angles, side, arc.grasps[side], None, -1.0, high)[1]) for side in SIDES]
     assert min(first) < 0.2 < 0.25 < arc.margin
+
+
+def test_grasps_that_do_not_follow_a_turn_to_its_end_turn_as_far_as_they_reach():
+    X_OA = valve_at(1.0)
+    place, _ = stances(distance_min=0.72, distance_max=0.76).find(X_OA, 1.5)
+    X_BA = compose(inverse(planar(*place.base)), X_OA)
+
+    def before_a_radian(X_BA, q, posture=None):  # the level bar's right end goes up
+        return bool(np.arcsin(np.clip(X_BA[2, 0], -1, 1)) < 0.99)
+
+    dut = stances(before_a_radian)
+    arc = dut.best_arc(X_BA, 1.5)
+    assert 0.4 <= arc.turn < 1.0 and arc.margin >= CONFIG.margin_min
+    assert stances().best_arc(X_BA, 1.5).turn == pytest.approx(1.5)
+    assert dut.find(X_OA, 1.5)[1] < 0  # but then the turn is not made, from anywhere

@@ -126,6 +126,7 @@ class ArcSearch:
     turn_angle: float
     groups: tuple[tuple[Pair, ...], ...]  # of `Stances.pairs`
     whole: bool  # see `Stances.check_arc`
+    split: bool  # a turn that no grasps hold to its end is turned as far as some reach
     near: Arc | None = None
     least: float = 0.0
     posture: np.ndarray | None = None
@@ -149,8 +150,10 @@ class StanceSearch:
     kept: bool = False  # the first group keeps a lift where it is: it will do where it is accepted
     group: int = 0
     index: int = 0  # of the next place in its group
+    split: bool = False  # in the second round: by several grasps, where no place serves with one
     arcs: ArcSearch | None = None  # at this place
     arc: Arc | None = None  # of the place before, to start from
+    begun: bool = False  # the hands reach handles from one of the places
     turned: float = 0.0  # of the turn, by the grasps at this place that are found [rad]
     grasps: int = 0  # how many these are
     least: float = 1.0  # their margin
@@ -343,12 +346,16 @@ class Stances:
         near: Arc | None = None,
         least: float = 0.0,
         posture: np.ndarray | None = None,
+        *,
+        split: bool = True,
     ) -> ArcSearch:
-        """A search for the grasps that turn the valve the best; see `best_arc`."""
+        """A search for the grasps that turn the valve the best; see `best_arc`. split: see ArcSearch."""
         whole = abs(turn_angle) <= ONE_GRASP
-        asked = turn_angle if whole else float(np.copysign(ONE_GRASP / 2, turn_angle))
-        groups = tuple(group for group in self.pairs(X_BA, asked))
-        return self._onwards(ArcSearch(X_BA, turn_angle, groups, whole, near, least, posture))
+        return self._onwards(ArcSearch(X_BA, turn_angle, self._groups(X_BA, turn_angle, whole), whole, split, near,
+                                       least, posture))  # fmt: skip
+
+    def _groups(self, X_BA: np.ndarray, turn_angle: float, whole: bool) -> tuple[tuple[Pair, ...], ...]:
+        return tuple(self.pairs(X_BA, turn_angle if whole else float(np.copysign(ONE_GRASP / 2, turn_angle))))
 
     def advance_arc(self, search: ArcSearch) -> ArcSearch:
         """The search after one more pair of grasps."""
@@ -372,6 +379,10 @@ class Stances:
             if s.best.margin >= self.config.margin_min:
                 break
             group, index = group + 1, 0
+        long = abs(s.turn_angle) > self.config.arc_least
+        if s.whole and s.split and s.begun and long and s.best.margin < self.config.margin_min:
+            groups = self._groups(s.X_BA, s.turn_angle, False)
+            return self._onwards(dc.replace(s, whole=False, groups=groups, group=0, index=0, best=Arc(), begun=False))
         return dc.replace(s, done=True)
 
     def best_arc(
@@ -382,8 +393,8 @@ class Stances:
         least: float = 0.0,
         posture: np.ndarray | None = None,
     ) -> Arc:
-        """The first grasps of `pairs` that serve for the whole turn, the best of their group; for a turn that is longer
-        than one grasp reaches, those that turn the farthest. near: a like arc; the rest: as of `check_arc`."""
+        """The first grasps of `pairs` that serve for the whole turn, the best of their group; where none does, those
+        that turn the farthest. near: a like arc; the rest: as of `check_arc`."""
         search = self.begin_arc(X_BA, turn_angle, near, least, posture)
         while not search.done:
             search = self.advance_arc(search)
@@ -443,13 +454,15 @@ class Stances:
         if s.arcs is None:
             X_BA = turned(compose(inverse(planar(*place.base)), s.X_OA), s.turned)
             alone = s.grasps == 0 and abs(asked) <= ONE_GRASP
-            arcs = self.begin_arc(X_BA, asked, s.arc, max(s.margin, 0.0) if alone else 0.0, place.posture)
+            arcs = self.begin_arc(
+                X_BA, asked, s.arc, max(s.margin, 0.0) if alone else 0.0, place.posture, split=s.split
+            )
         else:
             arcs = s.arcs
         arcs = self.advance_arc(arcs)
         if not arcs.done:
             return dc.replace(s, arcs=arcs)
-        s, arc = dc.replace(s, arcs=None), arcs.best
+        s, arc = dc.replace(s, arcs=None, begun=s.begun or arcs.begun), arcs.best
         least, left = min(s.least, arc.margin), asked - arc.turn
         if arc.margin >= c.margin_min and abs(left) > 1e-9 and least > s.margin and s.grasps < 3:
             # Four grasps turn a valve round, mostly; then they repeat themselves.
@@ -462,6 +475,8 @@ class Stances:
         more = group < len(s.places) and (index > 0 or margin < good)
         done = margin >= c.margin_enough or not more
         fresh = dc.replace(s, group=group, index=index, arc=arc, turned=0.0, grasps=0, least=1.0)
+        if done and margin < c.margin_min and s.begun and not s.split and c.arc_least < abs(s.turn_angle) <= ONE_GRASP:
+            return dc.replace(fresh, group=0, index=0, split=True)
         return dc.replace(fresh, best=best, margin=margin, done=done)
 
     def find(self, X_OA: np.ndarray, turn_angle: float, viewer: np.ndarray | None = None) -> tuple[Place, float]:

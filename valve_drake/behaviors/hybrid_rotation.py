@@ -20,6 +20,7 @@ from valve_drake.behaviors.closed_chain import (
     gravity_wrench,
     make_chain,
 )
+from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.hybrid_rotation_grasp import Grasping
 from valve_drake.behaviors.hybrid_rotation_hands import Memory as Memory
 from valve_drake.behaviors.hybrid_rotation_hands import Pair
@@ -88,6 +89,7 @@ class HybridRotation(Grasping, Turning, Releasing):
     # ------------------------------------------------------------ sensing
     def _sense(self, dt: float, m: Memory, state: RobotState, mode: ModeState, X: Pair) -> Memory:
         """Tares the sensors while the hands stand still at the stand-off; elsewhere filters the contact wrenches."""
+        c: HybridRotationConfig = self.config
         raw = (state.left_wrench, state.right_wrench)
         if mode.mode == Mode.REACH:
             speeds = (*state.left_arm_velocity.tolist(), *state.right_arm_velocity.tolist())
@@ -96,13 +98,13 @@ class HybridRotation(Grasping, Turning, Releasing):
             load = np.array(
                 [raw[k] - gravity_wrench(X[k][:, :3], self.robot.hands[side]) for k, side in enumerate(SIDES)]
             )
-            a = 1 - np.exp(-dt / self.config.tare_time)
+            a = 1 - np.exp(-dt / c.tare_time)
             bias = m.bias + a * (load - m.bias) if m.tared else load
             return changed(m, bias=bias, tared=True, wrenches=np.zeros((2, 6)))
         now = np.array(
             [contact_wrench(raw[k], m.bias[k], X[k][:, :3], self.robot.hands[side]) for k, side in enumerate(SIDES)]
         )
-        a = 1 - np.exp(-2 * np.pi * self.config.filter * dt)
+        a = 1 - np.exp(-2 * np.pi * c.filter * dt)
         last = np.where(
             np.isfinite(m.wrenches), m.wrenches, now
         )  # one report that is not finite must not stay in the filter

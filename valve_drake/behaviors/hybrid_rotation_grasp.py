@@ -6,6 +6,7 @@ from valve_drake.behaviors.closed_chain import (
     Chain,
     twists,
 )
+from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.hybrid_rotation_hands import Hands, Memory
 from valve_drake.memory import changed
 from valve_drake.messages import (
@@ -22,7 +23,7 @@ class Grasping(Hands):
     def _grasp(
         self, time: float, dt: float, m: Memory, state: RobotState, mode: ModeState, chain: Chain
     ) -> tuple[Memory, np.ndarray, np.ndarray]:
-        c = self.config
+        c: HybridRotationConfig = self.config
         gripper = np.array([0.0, c.grip_force])
         extra = np.zeros(6)
         if m.stage == "close":

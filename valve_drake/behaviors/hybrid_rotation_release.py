@@ -7,6 +7,7 @@ from valve_drake.behaviors.closed_chain import (
     twists,
 )
 from valve_drake.behaviors.grasp_geometry import standoff
+from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.hybrid_rotation_hands import Hands, Memory
 from valve_drake.memory import changed
 from valve_drake.messages import (
@@ -23,7 +24,7 @@ class Releasing(Hands):
     def _release(
         self, time: float, dt: float, m: Memory, state: RobotState, mode: ModeState, chain: Chain
     ) -> tuple[Memory, np.ndarray, np.ndarray]:
-        c = self.config
+        c: HybridRotationConfig = self.config
         V = twists(chain, None, c, np.zeros(6))
         grip = np.array([0.0, c.grip_force])
         opened = np.array([self.robot.opening, c.open_force])

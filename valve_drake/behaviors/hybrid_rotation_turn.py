@@ -9,6 +9,7 @@ from valve_drake.behaviors.closed_chain import (
     turn_rate,
     twists,
 )
+from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.hybrid_rotation_hands import Hands, Memory
 from valve_drake.memory import changed
 from valve_drake.messages import (
@@ -27,7 +28,7 @@ class Turning(Hands):
     def _turn(
         self, time: float, dt: float, m: Memory, state: RobotState, mode: ModeState, chain: Chain
     ) -> tuple[Memory, np.ndarray, np.ndarray]:
-        c = self.config
+        c: HybridRotationConfig = self.config
         gripper = np.array([0.0, c.grip_force])
         asked = m.plan.turn
         sense = 1.0 if asked >= 0 else -1.0
@@ -59,7 +60,7 @@ class Turning(Hands):
 
     def _stall(self, time: float, m: Memory, sense: float, left: float) -> Memory:
         """After a stall it turns the other way: if that is free, the stall was an end stop, else the valve is stuck."""
-        c = self.config
+        c: HybridRotationConfig = self.config
         since, angle = m.progress_at
         if sense * (m.turned - angle) > c.stall_angle:
             return changed(m, progress_at=(time, m.turned))
@@ -88,7 +89,7 @@ class Turning(Hands):
 
     def _watch(self, time: float, dt: float, m: Memory, state: RobotState, chain: Chain) -> Memory:
         """Force trip, grasp lost, one hand carrying all, end of reach."""
-        c = self.config
+        c: HybridRotationConfig = self.config
         force = [math.hypot(*f) for f in chain.f.tolist()]
         m = changed(m, tripped=m.tripped + 1 if max(force) > c.force_trip else 0)
         if m.tripped >= 3:
