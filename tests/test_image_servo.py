@@ -367,6 +367,7 @@ def test_ports():
         "robot_state": "in abstract",
         "mode": "in abstract",
         "marks": "in abstract",
+        "plan": "in abstract",
         "command": "out abstract",
         "status": "out abstract",
         "servo": "out abstract",

@@ -5,6 +5,7 @@ scenario are in diagrams/ (made by `valve-drake draw`; a test keeps them current
 """
 
 import dataclasses as dc
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,6 +18,7 @@ from pydrake.systems.primitives import Multiplexer
 from valve_drake import named_files
 from valve_drake.behaviors.base_approach import BaseApproachConfig
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
+from valve_drake.behaviors.blind_servo import STRAIGHT, BlindServo
 from valve_drake.behaviors.grasp_geometry import Stances
 from valve_drake.behaviors.hybrid_rotation import HybridRotation
 from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
@@ -95,6 +97,7 @@ WIRES: tuple[tuple[str, str], ...] = (
     ("stance_planner.grasps", "kinematic_approach.grasps"),
     ("stance_planner.path", "kinematic_approach.path"),
     ("kinematic_approach.plan", "hybrid_rotation.plan"),
+    ("kinematic_approach.plan", "image_servo.plan"),
     ("hybrid_rotation.turn", "kinematic_approach.turn"),
     # all commands reach the robot through command_selector
     *((f"{block}.command", f"command_selector.{block}") for block in BEHAVIORS),
@@ -158,7 +161,9 @@ def robot_of(scenario: Scenario) -> Robot:
     robot = Robot.load(named_files.find(scenario, "robot"), scenario.valve)
     d = robot.description
     try:
-        require(d.servo == "camera", "servo", "camera (another way is not supported yet)", d.servo)
+        for side in SIDES if d.servo == "camera" else ():
+            name = f"{side}_wrist"
+            require(bool(d.cameras[name]), f"cameras.{name}", "given, or servo: none", d.cameras[name])
         for key in ("pan", "tilt"):
             require(bool(getattr(d.gaze, key)), f"gaze.{key}", "given: the search turns the eyes by it", "")
         require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
@@ -276,12 +281,18 @@ def _head(scenario: Scenario) -> StereoHead:
 def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     """All blocks between the station's outputs and its inputs: the same objects for every station."""
     head = _head(scenario)
-    taught = load_taught(named_files.find(scenario, "taught"))
     valve, marker = scenario.valve, scenario.valve.target()
-    view = {side: taught[side].view for side in SIDES}
-    area = {side: taught[side].area for side in SIDES}
     X_LEyes = make(np.eye(3), head.X_LR[:, 3] / 2)  # between both head cameras: a near marker stays in both images
     robot = robot_of(scenario)
+    servo: ImageServo | BlindServo
+    if robot.description.servo == "camera":
+        taught = load_taught(named_files.find(scenario, "taught"))
+        view = {side: taught[side].view for side in SIDES}
+        area = {side: taught[side].area for side in SIDES}
+        servo = ImageServo(scenario.image_servo, robot, taught)
+    else:  # marks are never large enough: the hands reach the stand-off
+        view, area = dict.fromkeys(SIDES, STRAIGHT), dict.fromkeys(SIDES, math.inf)
+        servo = BlindServo(scenario.image_servo, robot)
     collision = CollisionModel(robot)
     if touching := collision.touching(None, robot.home):
         raise ConfigError(f"{scenario.robot}: arms.left.home and arms.right.home must be free of all: {touching[0]}")
@@ -303,7 +314,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
         BaseApproachSystem(_clear(scenario.base_approach, robot), valve),
         StancePlannerSystem(StancePlanner(scenario.stance_planner, stances)),
         KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, robot, valve, area)),
-        ImageServoSystem(ImageServo(scenario.image_servo, robot, taught)),
+        ImageServoSystem(servo),
         HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, valve, robot, view)),
         CommandSelectorSystem(scenario.command_selector, initial_commands(scenario), robot.torso, robot.arms),
         SupervisorSystem(scenario.supervisor, opening=valve.sense),

@@ -269,7 +269,10 @@ def _read_files(scenario: Scenario) -> dict[str, bytes]:
     """The files that a scenario names, by the name under which a log holds them. Raises ConfigError unless each is
     what it should be: nothing else of a user's files gets into a log."""
     files = {}
+    blind = robot_of(scenario).description.servo != "camera"
     for key, load in READERS.items():
+        if key == "taught" and blind:  # nothing reads it
+            continue
         path = named_files.find(scenario, key)
         load(path)
         files[FILES[key]] = descriptions.text(path) if key == "robot" else path.read_bytes()
@@ -551,7 +554,7 @@ def replay(
                 writer.write_metadata("result", _result_metadata(mode, recording.end))
         wall = time.perf_counter() - begin
     where, error = (writer.where, writer.error) if writer is not None else (None, "")
-    notes += _notes(log, recorded, recording, changed)
+    notes += _notes(log, recorded, recording, changed, data)
     return Replay(comparison, recording.end, wall, log.damage, notes, where, error)
 
 
@@ -662,11 +665,15 @@ def _feed(player: Player, recording: Recording, show: Callable[[ModeState, float
     return player.mode
 
 
-def _notes(log: LogReader, recorded: Scenario, recording: Recording, changed: Collection[str]) -> list[str]:
-    """What is not as it was when the log was written, and what of it is not replayed."""
+def _notes(
+    log: LogReader, recorded: Scenario, recording: Recording, changed: Collection[str], read: Collection[str]
+) -> list[str]:
+    """What is not as it was when the log was written, and what of it is not replayed. read: the files that are, by the
+    names under which a log holds them."""
     facts, now = log.metadata["run"], versions()
     notes = [f"{name} was {facts[name]}, is {now[name]}" for name in now if facts.get(name, now[name]) != now[name]]
-    for key in (key for key, name in FILES.items() if key not in changed and name not in log.attachments):
+    needed = {key: name for key, name in FILES.items() if key not in changed and name in read}
+    for key in (key for key, name in needed.items() if name not in log.attachments):
         notes.append(
             f"the log does not hold its {key}: {getattr(recorded, key) or 'that of its robot'} of today stands in"
         )

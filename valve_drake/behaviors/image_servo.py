@@ -62,6 +62,9 @@ class ImageServoConfig(Config):
     )
     reach: float = number(0.20, 0.02, 0.5, "a hand farther than this from where servoing began has gone astray [m]")
     gripper_force: float = number(40.0, 5.0, 100.0, "of the finger actuator [N]")
+    touch_force: float = number(10.0, 2.0, 60.0, "without a camera in the hand: a force that tells of a touch [N]")
+    touch_reach: float = number(0.015, 0.002, 0.05, "the same: a touch so near to the grasp is the handle [m]")
+    rest: float = number(0.3, 0.02, 5.0, "the same: both hands stand so long at their handles [s]")
 
 
 @dc.dataclass(frozen=True)

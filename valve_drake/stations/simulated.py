@@ -10,21 +10,22 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
+from pydrake.common.value import Value
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, InputPort, OutputPort
-from pydrake.systems.primitives import AffineSystem, Demultiplexer, MatrixGain
+from pydrake.systems.primitives import AffineSystem, ConstantValueSource, Demultiplexer, MatrixGain
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
-from valve_drake.messages import DEVICES, LEFT, SIDES, Health
+from valve_drake.messages import DEVICES, LEFT, SIDES, CameraFrame, Health
 from valve_drake.ports import TICK, Block, Inputs, Outputs, PythonSystem
 from valve_drake.robot.description import RobotDescription
 from valve_drake.robot.robot import Robot
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
-from valve_drake.stations.contract import CAMERAS, TRUTH, check_contract
+from valve_drake.stations.contract import CAMERAS, TRUTH, WRISTS, check_contract
 from valve_drake.stations.mishaps import LostGripSystem, WheelSlipSystem, slips
 from valve_drake.stations.plant_system import COMMANDS, STEM, PlantSystem
 from valve_drake.stations.scene import add_scene, panel_pose, start_pose
@@ -132,9 +133,10 @@ class HealthSystem(Block[Inputs, None]):
     """Reports that all devices work and were heard just now: the simulated machine has no faults of its own."""
 
     OUTPUTS = {"health": Health}
-    DEVICES = tuple(device for device in DEVICES if device != "robot")
 
-    def __init__(self) -> None:
+    def __init__(self, missing: Sequence[str] = ()) -> None:
+        """missing: devices that this robot does not have."""
+        self.DEVICES = tuple(device for device in DEVICES if device not in ("robot", *missing))
         super().__init__("health", period=1 / 32, slot=0)
 
     def step(self, time: float, inputs: Inputs, memory: None) -> tuple[None, Outputs]:
@@ -214,11 +216,11 @@ def wrist_lens(focal: float) -> Lens:
 def make_mounts(
     head: StereoHead, simulation: SimulationConfig, seed: int, frames: Mapping[str, str]
 ) -> dict[str, Mount]:
-    """All four cameras of the simulated robot. frames: of its model, as robot.yaml's `cameras` names them."""
+    """The cameras of the simulated robot, two or four. frames: of its model, as robot.yaml's `cameras` names them."""
     wrist = wrist_lens(simulation.camera.wrist_focal)
     return {
         **true_head(head, simulation.error, seed, frames["head_left"]),
-        **{f"{side}_wrist": Mount(wrist, frames[f"{side}_wrist"], np.eye(3, 4)) for side in SIDES},
+        **{name: Mount(wrist, frames[name], np.eye(3, 4)) for side in SIDES if frames[name := f"{side}_wrist"]},
     }
 
 
@@ -378,13 +380,17 @@ def make_simulated_station(
 
     camera = simulation.camera
     images = CameraRig(*rig_arguments(simulation, shape, head, seed, robot.description)) if workers is None else workers
-    for name in CAMERAS:
+    missing = [name for name in WRISTS if not robot.description.cameras[name]]
+    for name in missing:  # its port never shows an image
+        nothing = builder.AddNamedSystem(name, ConstantValueSource(Value(CameraFrame(camera=name))))
+        builder.ExportOutput(nothing.get_output_port(), f"{name}.image")
+    for name in [name for name in CAMERAS if name not in missing]:
         period = camera.head_period if name.startswith("head") else camera.wrist_period
         system = builder.AddSystem(CameraSystem(name, plant.num_positions(), period, camera.latency, images))
         builder.Connect(ports[POSITIONS], system.GetInputPort("positions"))
         builder.ExportOutput(system.GetOutputPort("image"), f"{name}.image")
 
-    health = builder.AddSystem(HealthSystem())
+    health = builder.AddSystem(HealthSystem(missing))
     builder.ExportOutput(health.GetOutputPort("health"), "health")
 
     truth = builder.AddSystem(TruthSystem(physics, valve))
