@@ -61,7 +61,8 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def skew(v: np.ndarray) -> np.ndarray:
     """[v]x with [v]x u = v cross u: (..., 3) -> (..., 3, 3)."""
-    return (v @ _SKEW).reshape(*np.shape(v)[:-1], 3, 3)
+    rows: np.ndarray = v @ _SKEW
+    return rows.reshape(*rows.shape[:-1], 3, 3)
 
 
 def rot_x(a: float) -> np.ndarray:

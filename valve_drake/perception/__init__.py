@@ -6,6 +6,8 @@ Each stage is a pair: `x.py` is mathematics in plain numpy and OpenCV, `x_system
     estimate.X_LV, estimate.covariance
 """
 
+import functools
+
 import numpy as np
 
 from valve_drake.camera.lens import StereoHead
@@ -15,6 +17,21 @@ from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.matching import StereoPositioningConfig
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
+
+
+@functools.lru_cache(maxsize=64)
+def _marker(size: tuple[float, ...]) -> Marker:
+    """Checked once: a check takes as long as a step of the fit."""
+    marker = Marker.of(size, max(0.15, max(size)))
+    marker.check()
+    return marker
+
+
+@functools.lru_cache(maxsize=64)
+def _estimator(method: str) -> RectangleEstimatorConfig:
+    config = RectangleEstimatorConfig(method=method)
+    config.check()
+    return config
 
 
 def estimate_rectangle(
@@ -36,14 +53,14 @@ def estimate_rectangle(
     marker_size: 2 X_w, 2 Y_w [m]. The result's `found` is False, with a `reason`, if there is no such marker.
     Raises ConfigError for an impossible marker or configuration, ValueError for images of another size.
     """
-    marker = Marker.of(marker_size, max(0.15, max(marker_size)))
+    marker = _marker(tuple(marker_size))
     # What is not given is right; checking it would cost more than a step of the fit.
-    given = [config for config in (segmentation, lines, matching) if config is not None]
+    given = [config for config in (segmentation, lines, matching, estimator) if config is not None]
     segmentation = segmentation or ColorSegmentationConfig()
     lines = lines or LineFittingConfig(single_camera=right is None)
     matching = matching or StereoPositioningConfig()
-    estimator = estimator or RectangleEstimatorConfig(method=method)
-    for config in (marker, estimator, *given):
+    estimator = estimator or _estimator(method)
+    for config in given:
         config.check()
     seen = []
     for image, lens, camera in ((left, head.left, "left"), (right, head.right, "right")):

@@ -21,6 +21,7 @@ from valve_drake.perception.refinement import Fit, linearize, refine
 from valve_drake.perception.views import View
 
 _PRUNE_CHI2 = 1000.0  # beside a fit of a smaller chi^2, a start that is so much worse is not refined
+_TURNS = [frames.rot_z(-k * np.pi / 2) for k in range(4)]
 _QUARTER = frames.rot_z(-np.pi / 2)  # the image's corner 0 is the model's corner 1: V turns back against the image
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
@@ -172,8 +173,7 @@ def _along_y(votes: list[int]) -> bool:
 
 def _mark_votes(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker) -> list[int]:
     """Green marks found where they should be if V were this pose turned back by 0, 1, 2, 3 quarters -> 4."""
-    turns = [frames.rot_z(-k * np.pi / 2) for k in range(4)]
-    places = np.vstack([*(marker.marks @ turn.T for turn in turns), np.zeros((1, 3))])
+    places = np.vstack([*(marker.marks @ turn.T for turn in _TURNS), np.zeros((1, 3))])
     votes = np.zeros(4, int)
     for view in views:
         P = (places @ R.T + p) @ view.X_CL[:, :3].T + view.X_CL[:, 3]

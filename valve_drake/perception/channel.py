@@ -59,6 +59,11 @@ def mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np.
     return cv2.transform(part.astype(np.float32), np.array([[*w, -w @ ring]], np.float32)), contrast, lost
 
 
+def _within(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """np.clip, which takes 20 us more to find out what its limits are."""
+    return np.minimum(np.maximum(values, low), high)
+
+
 def _clipped(part: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
     """The share of clipped pixels beside each side, inside or outside, whichever is larger, in each colour: (4, 3).
 
@@ -72,7 +77,7 @@ def _clipped(part: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
     beside = min(max(0.12 * float(lengths.min()), 3.0), 6.0) * np.array([[[[1.0]]], [[[-1.0]]]])
     at = corners[:, None] + along[:, None] * _ALONG[:, None] + beside * inward[:, None]  # (2, 4, n, 2)
     u, v = np.rint(at).astype(int).transpose(3, 0, 1, 2)
-    values = part[np.clip(v, 0, part.shape[0] - 1), np.clip(u, 0, part.shape[1] - 1)]
+    values = part[_within(v, 0, part.shape[0] - 1), _within(u, 0, part.shape[1] - 1)]
     share = ((values >= _BRIGHT) | (values <= _DARK)).mean(2).max(0)
     return share if share.any() else None
 
@@ -125,5 +130,5 @@ def even_light(part: np.ndarray, small: np.ndarray, inside: np.ndarray, step: in
     rows, columns = (np.arange(n)[shape] for n, shape in zip(part.shape, ((..., None), (None, ...))))
     s = np.tanh(((columns - middle[0]) * best[0] + (rows - middle[1]) * best[1]) / size + best[2])
     lit = np.maximum(one, other)
-    part = (part / np.clip((levels[0] + levels[1] * s[..., None]) / lit, 0.1, 1)).astype(np.float32)
+    part = (part / _within((levels[0] + levels[1] * s[..., None]) / lit, 0.1, 1.0)).astype(np.float32)
     return part, every_nth(part, step)
