@@ -267,6 +267,7 @@ def fit(
     mean, scale = seen.mean(0), seen.std(0) + 1e-3
     if start is not None:
         mean, scale, span = start.mean, start.scale, start.span
+        hidden = (start.weights[0].shape[1], start.weights[1].shape[1])
     silence = ((Batch().rows(np.zeros(4 * RATE, np.int16))[-1] - mean) / scale).astype(np.float32)
     rows = [(row.astype(np.float32) - mean) / scale for row, said in examples if len(said) + 3 < len(row) < 150]
     said = [said for row, said in examples if len(said) + 3 < len(row) < 150]
