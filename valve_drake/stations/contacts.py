@@ -1,7 +1,8 @@
 """What touches what in the simulated plant: whether both pads of a hand hold the valve, and what touches besides.
 
 A hand holds by its pads (`grippers.SIDE.pads` of robot.yaml) on the valve's moving part. Its other fingers may touch
-that part, too, and fingers each other: they neither hold nor collide. Every other contact of the robot is a collision, also one with itself.
+that part, too, and fingers each other: they neither hold nor collide. Every other contact of the robot is a collision,
+also one with itself.
 """
 
 from collections.abc import Iterable
