@@ -2,6 +2,7 @@
 physics and once each for the cameras and the 3D view, and by pictures in the documents."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -43,12 +44,14 @@ def panel_pose(valve: ValveConfig) -> np.ndarray:
     return make(rot_z(valve.yaw) @ rot_y(valve.tilt) @ R0, np.array([0, 0, valve.height]))
 
 
-def _marker_offset(valve: ValveConfig) -> np.ndarray | None:
-    """X_VM: a marker that was stuck on by hand, in the place where it is believed to be (3, 4)."""
+def _marker_offset(valve: ValveConfig, size: Sequence[float]) -> np.ndarray | None:
+    """X_VM: a marker that was stuck on by hand, in the place where it is believed to be (3, 4). None of it dips into
+    the face that carries it."""
     tilt, place = valve.marker_tilt, valve.marker_place
     if not any((*tilt, *place)):
         return None
-    return make(rot_x(tilt[0]) @ rot_y(tilt[1]) @ rot_z(tilt[2]), np.array([*place, 0.0]))
+    lift = abs(tilt[0]) * size[1] / 2 + abs(tilt[1]) * size[0] / 2
+    return make(rot_x(tilt[0]) @ rot_y(tilt[1]) @ rot_z(tilt[2]), np.array([*place, -lift]))
 
 
 def start_pose(start: StartConfig, valve: ValveConfig) -> np.ndarray:
@@ -68,7 +71,7 @@ def add_scene(
 ) -> Scene:
     """Adds everything to a plant that is not finalized. The valve's limits and friction are those of the config."""
     robot_model = add_robot(plant, robot)
-    valve_model = add_valve(plant, shape, _marker_offset(valve))
+    valve_model = add_valve(plant, shape, _marker_offset(valve, shape.marker.size))
     X_WP = panel_pose(valve)
     plant.WeldFrames(  # mounts the panel in the room
         plant.world_frame(),
