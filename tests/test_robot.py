@@ -422,7 +422,7 @@ USELESS = {
     "home that touches": (
         [at("arms.left.home", [0, -1.2, 0, 0, 0, 0]), at("arms.right.home", [0, 1.2, 0, 0, 0, 0])],
         [],
-        "arms.left.home and arms.right.home must be free of all: robot::",
+        "arms.left.home and arms.right.home must be free of all: left_",
     ),
     "no tilt": ([at("gaze.tilt", "")], [], "gaze.tilt must be given: the search turns the eyes by it"),
     "no servo": ([at("servo", "none")], [], "servo must be camera"),

@@ -129,10 +129,14 @@ class CollisionModel:
         """
         return len(self._near(X_BA, q, posture)) == 0
 
-    def touching(self, X_BA: np.ndarray | None, q: np.ndarray) -> list[str]:
-        """Names of the pairs that are nearer than the clearance, for messages."""
-        name = self._scene_graph.model_inspector().GetName
-        pairs = self._near(X_BA, q)
+    def touching(self, X_BA: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None) -> list[str]:
+        """The pairs of shapes that are nearer than the clearance, as link::shape, for messages; as of is_free."""
+        inspector = self._scene_graph.model_inspector()
+
+        def name(shape: GeometryId) -> str:
+            return f"{self._link(shape)}::{inspector.GetName(shape).rpartition('::')[2]}"
+
+        pairs = self._near(X_BA, q, posture)
         return [f"{name(p.id_A)} - {name(p.id_B)}: {1e3 * p.distance:.0f} mm" for p in pairs]
 
     def _near(

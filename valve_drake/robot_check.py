@@ -459,7 +459,29 @@ def _reach(report: Report, robot: Robot, scenario: Scenario, collision: Collisio
         if tilt == 0 and (best is None or margin > best[0]):
             best = margin, valve, place
     _judge_reach(report, spec, own)
+    if best is None or best[0] < spec.margin_min:
+        _in_the_way(report, stances, collision)
     return None if best is None else best[1:]
+
+
+def _in_the_way(report: Report, stances: Stances, collision: CollisionModel) -> None:
+    """Where no valve is turned: which of the robot's own links keep the arms from it, if that is what does."""
+    found: dict[str, int] = {}
+
+    def look(X_BA: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None) -> bool:
+        for pair in collision.touching(X_BA, q, posture):
+            links = " - ".join(shape.partition("::")[0] for shape in pair.split(" - "))
+            found[links] = found.get(links, 0) + 1
+        return True
+
+    heights = [row.height for row in report.reach if row.tilt == 0]
+    height = min(heights, key=lambda h: abs(h - 1.1))
+    X_WA = compose(panel_pose(ValveConfig(height=height)), inverse(stances.valve.X_AP()))
+    _, margin = _find(dc.replace(stances, is_free=look), X_WA)
+    if margin >= stances.config.margin_min and found:
+        pair = max(found, key=lambda links: found[links])
+        text = f"links in the way are all that keeps it from {height:g} m, mostly {pair}: if neighbours, collision.srdf"
+        report.add(MISSING, "reach", "collision", text)
 
 
 def _stances(robot: Robot, scenario: Scenario, collision: CollisionModel) -> Stances:
