@@ -19,14 +19,15 @@ from valve_drake.stations.scene import add_scene, panel_pose
 from valve_drake.valve.valve import turned
 
 LEVELS = sorted(path.name.split(".")[0] for path in (resources.diagrams() / "levels").iterdir())
+WORK = [name for name in LEVELS if name[:6] in ("level1", "level2", "level3", "level4")]  # that must succeed
 
 
 def test_all_levels_are_there():
-    assert {name.split("_")[0] for name in LEVELS} >= {"level1", "level2", "level3", "level4"}
-    assert len(LEVELS) == 11
+    assert len(WORK) == 11
+    assert all(scenarios.load(name) for name in LEVELS)
 
 
-@pytest.mark.parametrize("name", LEVELS)
+@pytest.mark.parametrize("name", WORK)
 def test_a_level_has_a_stance_from_which_its_turn_is_made_and_its_valve_turns_as_far(name):
     scenario = scenarios.resolve(scenarios.load(name, ["seed=2"]))
     shape, valve = scenario.valve, scenario.simulation.valve
