@@ -163,7 +163,7 @@ def test_a_link_that_is_lost_in_mid_turn_holds_the_grasp_and_the_turn_goes_on_by
 def test_a_whole_session_by_voice_from_wav_files_over_a_radio(tmp_path, capsys):
     """A voice that the recogniser was not taught with; nothing is typed. Other speech in between moves nothing."""
     recogniser = pytest.importorskip("valve_drake.voice.recogniser")
-    from valve_drake.operator.ear import read_wav
+    from valve_drake.operator.ear import PIECE, read_wav
     from valve_drake.voice import radio
     from valve_drake.voice.synthesis import Speaker, installed, say
 
@@ -187,13 +187,13 @@ def test_a_whole_session_by_voice_from_wav_files_over_a_radio(tmp_path, capsys):
         return read_wav(path, "--file")
 
     noise = recorded("the weather report for the islands", 99)
-    hiss = np.round(32767 * radio.transmit(np.zeros(RATE, np.float32), radio.AT_20_DB, 7, level=0.1)).astype(np.int16)
-    rng = np.random.default_rng(0)
+    silence = radio.transmit(np.zeros(250 * RATE, np.float32), radio.AT_20_DB, 7, level=0.1)
+    hiss = iter(np.round(32767 * silence).astype(np.int16).reshape(-1, round(PIECE * RATE)))
     path = tmp_path / "voice.mcap"
     session = Session(
         *("seed=1", "simulation.valve.travel=3.0", "simulation.valve.position=1.0"),
         ear=recogniser.Recogniser(),
-        noise=lambda count: np.roll(hiss, int(rng.integers(RATE)))[:count],
+        noise=lambda count: next(hiss),
         limit=240.0,
     )
     session.run(
