@@ -163,3 +163,5 @@ def test_wrist_cameras_are_asked_for_where_the_hands_are_servoed_by_them(tmp_pat
     (tmp_path / "seeing.robot.yaml").write_text(text)
     with pytest.raises(ConfigError, match="cameras.left_wrist must be given, or servo: none, got ''"):
         diagram.robot_of(dc.replace(scenario, robot=str(tmp_path / "seeing.robot.yaml")))
+    with pytest.raises(ConfigError, match="cameras.left_wrist must be given for station hardware, got ''"):
+        diagram.robot_of(dc.replace(scenario, station="hardware"))

@@ -161,9 +161,10 @@ def robot_of(scenario: Scenario) -> Robot:
     robot = Robot.load(named_files.find(scenario, "robot"), scenario.valve)
     d = robot.description
     try:
-        for side in SIDES if d.servo == "camera" else ():
-            name = f"{side}_wrist"
-            require(bool(d.cameras[name]), f"cameras.{name}", "given, or servo: none", d.cameras[name])
+        over_wire = scenario.station == "hardware"  # its channels are those of four cameras
+        words = "given for station hardware" if over_wire else "given, or servo: none"
+        for side in SIDES if over_wire or d.servo == "camera" else ():
+            require(bool(d.cameras[f"{side}_wrist"]), f"cameras.{side}_wrist", words, d.cameras[f"{side}_wrist"])
         for key in ("pan", "tilt"):
             require(bool(getattr(d.gaze, key)), f"gaze.{key}", "given: the search turns the eyes by it", "")
         require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
