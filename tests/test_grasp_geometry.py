@@ -241,7 +241,8 @@ def test_grasps_that_do_not_follow_a_turn_to_its_end_turn_as_far_as_they_reach()
         return bool(np.arcsin(np.clip(X_BA[2, 0], -1, 1)) < 0.99)
 
     dut = stances(before_a_radian)
-    arc = dut.best_arc(X_BA, 1.5)
+    assert dut.best_arc(X_BA, 1.5).margin < 0
+    arc = dut.best_arc(X_BA, 1.5, split=True)
     assert 0.4 <= arc.turn < 1.0 and arc.margin >= CONFIG.margin_min
     assert stances().best_arc(X_BA, 1.5).turn == pytest.approx(1.5)
     assert dut.find(X_OA, 1.5)[1] < 0  # but then the turn is not made, from anywhere

@@ -392,10 +392,15 @@ class Stances:
         near: Arc | None = None,
         least: float = 0.0,
         posture: np.ndarray | None = None,
+        *,
+        split: bool = False,
     ) -> Arc:
-        """The first grasps of `pairs` that serve for the whole turn, the best of their group; where none does, those
-        that turn the farthest. near: a like arc; the rest: as of `check_arc`."""
-        search = self.begin_arc(X_BA, turn_angle, near, least, posture)
+        """The first grasps of `pairs` that serve for the whole turn, the best of their group; for a turn that is longer
+        than one grasp reaches, and with `split` where none serves, those that turn the farthest.
+
+        near: a like arc; the rest: as of `check_arc`.
+        """
+        search = self.begin_arc(X_BA, turn_angle, near, least, posture, split=split)
         while not search.done:
             search = self.advance_arc(search)
         return search.best
