@@ -15,6 +15,7 @@ from valve_drake.camera.lens import load_head
 from valve_drake.checks import OperationFailed
 from valve_drake.stations.camera_rig import CameraRig, Capture
 from valve_drake.stations.camera_workers import CameraWorkers
+from valve_drake.stations.lcm_channels import image_message
 from valve_drake.stations.simulated import make_mounts
 
 
@@ -128,3 +129,10 @@ def test_a_process_without_threads_is_forked_and_any_other_starts_new_ones(rig, 
     assert kinds == 2 * (["Popen"] if threads else ["ForkProcess"])
     assert data == rig.frame("head_right", capture).data
     assert result.stderr == b""
+
+
+def test_an_image_on_its_way_has_no_pixels_and_says_its_size(rig):
+    frame = rig.exposed("head_left", captures(rig, 1)[0])
+    assert frame.image.size == 0
+    image = image_message(frame).images[0]
+    assert (image.width, image.height) == (640, 480) and image.data == frame.data

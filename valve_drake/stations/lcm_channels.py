@@ -376,7 +376,7 @@ def image_message(frame: CameraFrame) -> lcmt_image_array:
     image = lcmt_image()
     image.header = lcmt_header()
     image.header.utime, image.header.seq, image.header.frame_name = to_utime(frame.time), frame.sequence, frame.camera
-    image.height, image.width = frame.image.shape[:2]
+    image.width, image.height = jpeg_size(frame.data) or (0, 0)
     image.row_stride = 3 * image.width
     image.data, image.size = frame.data, len(frame.data)
     image.pixel_format, image.channel_type = image.PIXEL_FORMAT_RGB, image.CHANNEL_TYPE_UINT8
