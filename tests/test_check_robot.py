@@ -130,7 +130,7 @@ LACKS = {
 
 @pytest.mark.parametrize("case", LACKS)
 def test_what_a_robot_lacks_is_said_with_its_key(case, tmp_path, monkeypatch):
-    monkeypatch.setattr(robot_check, "HEIGHTS", (1.0,))
+    monkeypatch.setattr(robot_check, "_reach", lambda *arguments: None)  # it takes long, and is no matter here
     edit, change, level, words = LACKS[case]
     path = variant(tmp_path, edit or (lambda model: None), change or (lambda given: None))
     report = checked(path)
@@ -183,7 +183,7 @@ REAL = {
             (DOUBTFUL, "grasp opening: the fingers open by 42 mm"),
             (MISSING, "reach collision: links in the way are all that keeps it from"),
         ],
-        {0.5: False, 1.0: False},
+        {0.5: False, 1.2: False},
     ),
     "vega_1": (
         VEGA,

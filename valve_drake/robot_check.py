@@ -474,14 +474,16 @@ def _in_the_way(report: Report, stances: Stances, collision: CollisionModel) -> 
             found[links] = found.get(links, 0) + 1
         return True
 
-    heights = [row.height for row in report.reach if row.tilt == 0]
-    height = min(heights, key=lambda h: abs(h - 1.1))
-    X_WA = compose(panel_pose(ValveConfig(height=height)), inverse(stances.valve.X_AP()))
-    _, margin = _find(dc.replace(stances, is_free=look), X_WA)
-    if margin >= stances.config.margin_min and found:
-        pair = max(found, key=lambda links: found[links])
-        text = f"links in the way are all that keeps it from {height:g} m, mostly {pair}: if neighbours, collision.srdf"
-        report.add(MISSING, "reach", "collision", text)
+    upright = {row.height for row in report.reach if row.tilt == 0}
+    for height in sorted(upright, key=lambda h: abs(h - 1.1))[:3]:
+        found.clear()
+        X_WA = compose(panel_pose(ValveConfig(height=height)), inverse(stances.valve.X_AP()))
+        _, margin = _find(dc.replace(stances, is_free=look), X_WA)
+        if margin >= stances.config.margin_min and found:
+            pair = max(found, key=lambda links: found[links])
+            text = f"links in the way are all that keeps it from {height:g} m, mostly {pair}"
+            report.add(MISSING, "reach", "collision", f"{text}: if they are neighbours, collision.srdf")
+            return
 
 
 def _stances(robot: Robot, scenario: Scenario, collision: CollisionModel) -> Stances:
