@@ -86,7 +86,12 @@ class BaseApproachConfig(Config):
     still_speed: float = number(0.01, 0.001, 0.05, "a base that is measured slower is at rest [m/s]")
     still_rate: float = number(0.02, 0.002, 0.1, "a base that turns slower is at rest [rad/s]")
     attempts: int = number(4, 1, 20, "at driving in straight, before it fails")
-    stance_patience: float = number(5.0, 0.5, 60.0, "waits so long for a first stance [s]")
+    stance_patience: float = number(
+        12.0,
+        0.5,
+        60.0,
+        "waits so long for a first stance; raise it for arms and lifts that are searched for longer [s]",
+    )
     retreat_distance: float = number(0.5, 0.05, 2.0, "straight back from the stance [m]")
     retreat_speed: float = number(0.3, 0.02, 0.5, "[m/s]")
 
