@@ -41,7 +41,7 @@ class Turning(Hands):
         goal = asked if m.stage == "turn" else m.stalled_at + sense * c.back_off
         left = sense * (goal - m.turned)
         if m.stage == "turn" and left <= c.tolerance:
-            detail = f"{np.degrees(m.turned):.2f} deg by the hands"
+            detail = f"{np.degrees(m.plan.turned + m.turned):.2f} deg by the hands"
             status = Status(
                 time, m.activation, "succeeded", detail=detail, progress=1.0, value=m.plan.turned + m.turned
             )
@@ -68,11 +68,13 @@ class Turning(Hands):
             if left <= c.tolerance:  # free the other way: turn on
                 return changed(m, stage="turn", rate=0.0, progress_at=(time, m.turned), commanded=m.turned)
             if time - since > c.stall_time:
-                detail = f"stiff both ways at {np.degrees(m.turned):.1f} deg, {m.telemetry.torque:.1f} N m"
+                detail = (
+                    f"stiff both ways at {np.degrees(m.plan.turned + m.turned):.1f} deg, {m.telemetry.torque:.1f} N m"
+                )
                 return self._fail(time, m, Verdict.STUCK, detail)
         elif time - since > c.stall_time:
             if m.stalls > 0 and abs(m.turned - m.stalled_at) < np.radians(2):
-                detail = f"stopped twice at {np.degrees(m.turned):.1f} deg, free the other way"
+                detail = f"stopped twice at {np.degrees(m.plan.turned + m.turned):.1f} deg, free the other way"
                 return self._fail(time, m, Verdict.END_STOP, detail)
             if m.stalls >= 3:
                 return self._fail(time, m, Verdict.STUCK, f"stalled {m.stalls + 1} times")
@@ -103,5 +105,7 @@ class Turning(Hands):
             detail = f"{self._openings(state)}, left hand carries {100 * share:.0f} %"
             return self._fail(time, m, Verdict.SLIP, detail)
         if min(self.robot.margin(LEFT, state.left_arm), self.robot.margin(RIGHT, state.right_arm)) < 0.02:
-            return self._fail(time, m, Verdict.REACH_LIMIT, f"arms at their limit at {np.degrees(m.turned):.1f} deg")
+            return self._fail(
+                time, m, Verdict.REACH_LIMIT, f"arms at their limit at {np.degrees(m.plan.turned + m.turned):.1f} deg"
+            )
         return m
