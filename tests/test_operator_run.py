@@ -161,7 +161,7 @@ def test_a_link_that_is_lost_in_mid_turn_holds_the_grasp_and_the_turn_goes_on_by
 
 @pytest.mark.slow
 def test_a_whole_session_by_voice_from_wav_files_over_a_radio(tmp_path, capsys):
-    """A voice that the recogniser was not taught with; nothing is typed. Other speech in between moves nothing."""
+    """A synthetic voice; nothing is typed. Other speech in between moves nothing."""
     recogniser = pytest.importorskip("valve_drake.voice.recogniser")
     from valve_drake.operator.ear import PIECE, read_wav
     from valve_drake.voice import radio
