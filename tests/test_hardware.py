@@ -530,9 +530,11 @@ def test_an_image_that_cannot_be_decoded_is_no_news_and_a_fault_if_it_goes_on(pu
     faults = []
     for k in range(1, 130):
         if k % 16 == 1:
-            frame = encode_frame("left_wrist", 7 + puppet.now, k, noise(k), 90)
-            frame = dc.replace(frame, data=spoilt(way, frame.data))
-            puppet.bus.send("left_wrist.image", image_message(frame))
+            message = image_message(encode_frame("left_wrist", 7 + puppet.now, k, noise(k), 90))
+            image = message.images[0]
+            image.data = spoilt(way, bytes(image.data))
+            image.size = len(image.data)
+            puppet.bus.send("left_wrist.image", message)
         shown = puppet.step()
         assert look(puppet, shown, "left_wrist").sequence in (0, -1)
         puppet.link.send(puppet.tick * TICK, values(1, IN))

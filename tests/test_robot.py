@@ -425,7 +425,6 @@ USELESS = {
         "arms.left.home and arms.right.home must be free of all: left_",
     ),
     "no tilt": ([at("gaze.tilt", "")], [], "gaze.tilt must be given: the search turns the eyes by it"),
-    "no servo": ([at("servo", "none")], [], "servo must be camera"),
     "hands too small for the valve": ([at("opening", 0.03)], [], "opening must be at least 0.035: valve.handles.width"),
     "a selector that shuts the hands": ([], ["command_selector.gripper_high=0.08"], "opening must be at most command_"),
 }
