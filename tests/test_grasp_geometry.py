@@ -221,6 +221,18 @@ def test_arms_that_touch_something_where_they_draw_back_have_no_stance():
     assert blocked.check_arc(X_BA, np.pi / 2, arc.grasps).margin == -1
 
 
+@pytest.mark.parametrize("share", [0.0, 1 / 6, 0.5, 5 / 6, 1.0])
+def test_arms_that_touch_anywhere_along_the_turn_cannot_make_it(share):
+    X_OA = valve_at(1.0)
+    base, _ = stance(X_OA, 90, distance_min=0.76, distance_max=0.78)
+    X_BA = compose(inverse(planar(*base)), X_OA)
+    there = turned(X_BA, share * np.pi / 2)
+    arc = stances().best_arc(X_BA, np.pi / 2)
+    blocked = stances(lambda X_BA, q, posture=None: not np.allclose(X_BA, there))
+    assert arc.margin > 0.5
+    assert blocked.check_arc(X_BA, np.pi / 2, arc.grasps).margin == -1
+
+
 def test_a_redundant_arm_that_is_not_comfortable_begins_from_other_postures_too():
     pr2 = Robot.load(description.find("pr2/pr2.robot.yaml"))
     X_OA = compose(panel_pose(ValveConfig(height=1.22)), inverse(VALVE.X_AP()))

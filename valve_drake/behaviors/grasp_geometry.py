@@ -197,7 +197,7 @@ class Stances:
         least: the check ends where the margin falls to it: whoever asks knows a better arc.
         whole: a turn that is not followed to its end is out of reach; else as far as the margin is `margin_good`, or,
         if that is not `arc_least`, as far as it is accepted.
-        Unless the arms are free of all at the turn's start, middle and end, and drawn back, it is out of reach.
+        Unless the arms are free of all at every angle, and drawn back, it is out of reach.
         """
         c = self.config
         count = max(2, int(np.ceil(abs(turn_angle) / c.arc_step)) + 1)
@@ -307,7 +307,9 @@ class Stances:
                     return Arc(grasps=grasps, begun=True)
                 margin = min(margin, robot.margin(side, back))
                 backs[side].append(back)
-        poses = [(k, q, k) for k in (0, (last + 1) // 2, last)] + [(0, backs, 0), (last, backs, 1)]
+        # Ends and middle first: there most arms that will meet have met.
+        along = dict.fromkeys((0, last, (last + 1) // 2, *range(last)))
+        poses = [(k, q, k) for k in along] + [(0, backs, 0), (last, backs, 1)]
         for at, joints, k in poses:
             q_both = np.concatenate([joints[side][k] for side in SIDES])
             if not self.is_free(turned(X_BA, angles[at]), q_both, posture):
