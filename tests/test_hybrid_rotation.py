@@ -13,13 +13,18 @@ from robot_facts import ROBOT
 
 from valve_drake.behaviors import hybrid_rotation_turn
 from valve_drake.behaviors.closed_chain import contact_wrench, gravity_wrench, make_chain, turn_rate, twists
+from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances
 from valve_drake.behaviors.hybrid_rotation import HybridRotation, Memory
 from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
 from valve_drake.checks import ConfigError
-from valve_drake.frames import compose, cross, inverse, make, rot_y, rot_z, rotation, rotation_vector
+from valve_drake.frames import compose, cross, inverse, make, planar, rot_y, rot_z, rotation, rotation_vector
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, GraspPlan, Mode, ModeState, RobotState, Status
 from valve_drake.ports import TICK
+from valve_drake.robot import description
+from valve_drake.robot.robot import Robot
+from valve_drake.stations.scene import panel_pose
+from valve_drake.stations.simulation_config import ValveConfig
 from valve_drake.valve.valve import HandleConfig, Valve, turned
 
 CONFIG = HybridRotationConfig()
@@ -831,3 +836,25 @@ def test_block_holds_its_outputs_between_updates():
 def test_block_clones_are_independent():
     change = {"mode": ModeState(mode="release", activation=2)}
     assert_clones_are_independent(rig, change, ("command", "status", "turn"))
+
+
+def test_a_redundant_arm_keeps_to_the_way_that_was_planned():
+    """Left to itself its elbow wanders from tick to tick, away from what is known to be free of collision."""
+    pr2 = Robot.load(description.find("pr2/pr2.robot.yaml"))
+    X_OA = compose(panel_pose(ValveConfig(height=1.17)), inverse(VALVE.X_AP()))
+    X_BA, posture = compose(inverse(planar(-0.85, 0, 0)), X_OA), np.array([0.23])
+    arc = Stances(pr2, VALVE, StanceConfig(), VIEW, lambda *_: True).best_arc(X_BA, QUARTER, posture=posture)
+    both = {name: np.hstack([getattr(arc, name)[side] for side in SIDES]).ravel() for name in ("q_standoff", "way")}
+    law = HybridRotation(CONFIG, VALVE, pr2, VIEW)
+    off = {}
+    for name, way in (("planned", both["way"]), ("alone", np.zeros(0))):
+        plan = GraspPlan(found=True, turn=arc.turn, q_standoff=both["q_standoff"], way=way)
+        m = Memory(plan=plan, q=(arc.q[LEFT], arc.q[RIGHT]))
+        for angle in np.linspace(0, arc.turn, 1200):
+            hands = [VALVE.grasp(arc.grasps[side].handle, arc.grasps[side].sign) for side in SIDES]
+            X_BG = [compose(turned(X_BA, angle), X_AG) for X_AG in hands]
+            m = law._command(dc.replace(m, turned=angle), (X_BG[0], X_BG[1]), posture)
+            for k, side in enumerate(SIDES):
+                assert pr2.forward(side, m.q[k], posture) == pytest.approx(X_BG[k], abs=1e-4)
+        off[name] = max(np.abs(m.q[k] - arc.way[side][-1]).max() for k, side in enumerate(SIDES))
+    assert off["planned"] < 0.08 < 0.2 < off["alone"], off

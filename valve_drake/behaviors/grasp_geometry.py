@@ -81,6 +81,7 @@ class Arc:
 
     margin: the least of the arms over it; -1: out of reach. turn: how far it goes, at most what was asked for [rad].
     q, q_standoff: side -> joints at the turn's start, and at the stand-off before it (n,); empty if out of reach.
+    way: side -> joints at angles spread evenly from the start to `turn` (k, n).
     begun: the hands reach the handles where the turn begins.
     """
 
@@ -90,6 +91,7 @@ class Arc:
     q: Mapping[str, np.ndarray] = dc.field(default_factory=dict)
     q_standoff: Mapping[str, np.ndarray] = dc.field(default_factory=dict)
     begun: bool = False
+    way: Mapping[str, np.ndarray] = dc.field(default_factory=dict)
 
 
 OTHERS = 4  # postures that a redundant arm's way begins from, beside the first
@@ -315,7 +317,8 @@ class Stances:
             if not self.is_free(turned(X_BA, angles[at]), q_both, posture):
                 return Arc(grasps=grasps, begun=True)
         first, behind = ({side: joints[side][0] for side in SIDES} for joints in (q, backs))
-        return Arc(margin, float(angles[last]), grasps, first, behind, True)
+        way = {side: np.array(q[side][: last + 1]) for side in SIDES}
+        return Arc(margin, float(angles[last]), grasps, first, behind, True, way)
 
     # ------------------------------------------------------------ the best of all grasps
     def pairs(self, X_BA: np.ndarray, turn_angle: float) -> Iterator[tuple[Pair, ...]]:

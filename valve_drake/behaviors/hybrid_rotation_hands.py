@@ -23,6 +23,8 @@ from valve_drake.messages import (
 from valve_drake.robot.kinematics import RobotKinematics
 from valve_drake.valve.valve import Valve
 
+DRAWN = 0.03  # of a redundant arm's distance from its planned way, a tick: it follows that way by a quarter of a second
+
 Pair = tuple[np.ndarray, np.ndarray]  # of both hands, left first
 
 
@@ -119,7 +121,20 @@ class Hands:
         """Commands the poses X; a hand keeps its command if its pose has no inverse near the present joints."""
         q, kept = list(m.q), list(m.X)
         for k, side in enumerate(SIDES):
-            solution = self.robot.inverse(side, X[k], m.q[k], posture)
+            solution = self.robot.inverse(side, X[k], self._near(m, k), posture)
             if solution is not None and np.max(np.abs(solution - m.q[k])) < 0.5:
                 q[k], kept[k] = solution, X[k]
         return changed(m, X=(kept[0], kept[1]), q=(q[0], q[1]))
+
+    def _near(self, m: Memory, k: int) -> np.ndarray:
+        """From where hand k's joints are looked for. A redundant arm is drawn to the way that was planned, since only
+        that is known to be free of collision: left to itself its elbow wanders as the hand goes on."""
+        plan, count = m.plan, len(m.q[k])
+        if count <= 6 or not plan.way.size or not plan.turn:
+            return m.q[k]
+        way = plan.way.reshape(-1, len(plan.q_standoff))
+        way = way[:, :count] if k == 0 else way[:, -count:]
+        at = min(max(m.turned / plan.turn, 0.0), 1.0) * (len(way) - 1)
+        row = min(int(at), len(way) - 2)
+        planned = way[row] + (at - row) * (way[row + 1] - way[row])
+        return m.q[k] + DRAWN * (planned - m.q[k])

@@ -153,6 +153,7 @@ class StancePlanner:
             X_BG_right=X_BG[1],
             q_standoff=np.concatenate([arc.q_standoff[side] for side in SIDES]),
             posture=request.posture,
+            way=np.hstack([arc.way[side] for side in SIDES]).ravel(),
         )
 
     def _path(self, m: Memory, request: PlanRequest) -> Memory:
