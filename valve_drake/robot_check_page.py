@@ -7,18 +7,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from valve_drake.checks import shown
+from valve_drake.page_style import STYLE
 from valve_drake.robot_check import DOUBTFUL, MISSING, Finding, Reach, Report
 
 _MADE = "<meta name='generator' content='valve-drake check-robot'>"
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #1c2430; max-width: 1080px; margin: 2em auto; padding: 0 1em }
-h1 { font-size: 1.5em; margin-bottom: .2em }
-h2 { font-size: 1.1em; margin-top: 1.8em; border-bottom: 1px solid #d8dde4 }
-table { border-collapse: collapse }
-td, th { padding: .15em .9em .15em 0; text-align: right; font-variant-numeric: tabular-nums }
-td:first-child, th:first-child { text-align: left }
-th { color: #667; font-weight: 500 }
-.note { color: #667 }
+_STYLE = (
+    STYLE
+    + """\
 .yes { color: #1a7f37; font-weight: 600 } .no { color: #b3261e; font-weight: 600 }
 .missing, .doubtful { border-left: 4px solid #b3261e; background: #fdecea; padding: .3em .8em; margin: .3em 0 }
 .doubtful { border-color: #e39a1a; background: #fff4e0 }
@@ -27,6 +22,7 @@ th { color: #667; font-weight: 500 }
 figure { display: inline-block; margin: 0 1em 1em 0; vertical-align: top }
 img { max-width: 100%; border: 1px solid #d8dde4 }
 """
+)
 
 
 def is_page(path: Path) -> bool:

@@ -9,25 +9,21 @@ import numpy as np
 
 from valve_drake import frames
 from valve_drake.camera.calibration import Calibration
+from valve_drake.page_style import STYLE
 
 _GRID = np.array([10, 8])  # cells of an image, for coverage
 _MADE = "<meta name='generator' content='valve-drake calibrate'>"
 _ENLARGED = 50  # residuals in the maps
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #1c2430; max-width: 1080px; margin: 2em auto; padding: 0 1em }
-h1 { font-size: 1.5em; margin-bottom: .2em }
-h2 { font-size: 1.1em; margin-top: 1.8em; border-bottom: 1px solid #d8dde4 }
-table { border-collapse: collapse }
-td, th { padding: .15em .9em .15em 0; text-align: right; font-variant-numeric: tabular-nums }
-td:first-child, th:first-child { text-align: left }
-th { color: #667; font-weight: 500 }
+_STYLE = (
+    STYLE
+    + """\
 svg { background: #fafbfc; border: 1px solid #d8dde4; max-width: 100%; height: auto }
 figure { display: inline-block; margin: 0 1em 0 0 }
 .out { color: #b3261e; font-weight: 600 }
 .big { font-size: 1.25em; font-weight: 600 }
-.note { color: #667 }
 .warn { background: #fff4e0; border-left: 4px solid #e39a1a; padding: .3em .8em; margin: .3em 0 }
 """
+)
 
 
 def is_page(path: Path) -> bool:
