@@ -62,6 +62,21 @@ def test_area_does_not_depend_on_light():
     assert np.ptp(areas) / np.mean(areas) < 0.004
 
 
+def test_a_handle_whose_red_and_blue_are_clipped_leaves_the_mark_in_its_place():
+    """Green alone tells brightness: a mark of the wall's own green would be lost before it, and beside a dark hub."""
+    for z in (0.15, 0.2, 0.3):
+        X = facing(z, 0.3, 0.2, 0.0)
+        drawing = Drawing(WRIST, (190, 183, 210))
+        drawing.shape(frames.compose(X, frames.make(np.eye(3), np.array([-0.06, 0, 0.002]))), (8, 8, 8), (0.05, 0.03))
+        drawing.shape(frames.compose(X, frames.make(np.eye(3), np.array([0, 0, 0.001]))), (255, 232, 252), (0.09, 0.0125))
+        drawing.shape(X, (18, 182, 51), HALF)
+        mark = find_mark(drawing.finish(np.random.default_rng(0), blur=0.7, noise=2.0), CONFIG)
+        assert mark.found, mark.reason
+        center, area = truth(X)
+        np.testing.assert_allclose(mark.center, center, atol=0.15)
+        assert abs(mark.area / area - 1) < 0.008
+
+
 def test_feature_moves_linearly_with_the_hand():
     """The point of (u, v, 1) / sqrt(area): one Jacobian for the whole workspace."""
 

@@ -43,12 +43,10 @@ def mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np.
     part, small = even_light(part, small, inside, step)
     core = np.array(cv2.mean(small, inside)[:3])
     ring = np.array(cv2.mean(small, cv2.subtract(far, near))[:3])
-    difference = core - ring
-    if config.color_only:
-        difference = difference - difference.mean()
+    difference = _between(core, ring, np.full(3, True), config)
     lost = np.zeros(4)
     if clipped is not None:
-        whole = np.where(clipped.mean(0) > _CLIPPED_SHARE, 0.0, difference)
+        whole = _between(core, ring, clipped.mean(0) <= _CLIPPED_SHARE, config)
         if np.linalg.norm(whole) > 2 * config.min_contrast:
             difference = whole
         lost = clipped @ np.abs(difference) / max(float(np.abs(difference).sum()), 1e-9)
@@ -57,6 +55,17 @@ def mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np.
         return part[:, :, 0], 0.0, lost
     w = difference / (difference @ (core - ring))
     return cv2.transform(part.astype(np.float32), np.array([[*w, -w @ ring]], np.float32)), contrast, lost
+
+
+def _between(core: np.ndarray, ring: np.ndarray, colors: np.ndarray, config: SidesConfig) -> np.ndarray:
+    """By what inside and outside differ in these colours (3,), without their common brightness if it is not to count.
+
+    One colour alone tells nothing but brightness.
+    """
+    difference = np.where(colors, core - ring, 0.0)
+    if config.color_only and colors.any():
+        difference -= np.where(colors, difference[colors].mean(), 0.0)
+    return difference
 
 
 def _within(values: np.ndarray, low: float, high: float) -> np.ndarray:
