@@ -14,7 +14,7 @@ from robot_variants import part, put, seven_joints, variant, with_roll
 
 from valve_drake import cli, named_files, resources, yaml_file
 from valve_drake.checks import ConfigError
-from valve_drake.diagram import initial_commands, make_blocks, make_diagram, make_station
+from valve_drake.diagram import gaze_of, initial_commands, make_blocks, make_diagram, make_station
 from valve_drake.frames import compose, make, planar, rot_z
 from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.recording.signals import commanded
@@ -478,22 +478,40 @@ def test_files_of_a_robot_lie_beside_its_own_and_a_scenarios_go_before_them(tmp_
 
 
 @pytest.mark.parametrize(
-    ("joint", "upper", "words"),
+    ("joint", "upper", "key", "chosen", "clipped"),
     [
-        ("waist", 0.3, "valve_search.sweep_waist must be within what the robot's joint can do, [0, 0.3], got 0.5"),
-        (
-            "neck_pitch",
-            1.0,
-            "valve_search.pitch_high must be within what the robot's joint can do, [-0.5, 1]",
-        ),
-        ("neck_yaw", 1.2, "valve_search.yaw_limit must be within what the robot's joint can do, [0, 1.2], got 1.55"),
+        ("waist", 0.3, "sweep_waist", 0.4, 0.3),
+        ("neck_pitch", 1.0, "pitch_high", 1.02, 1.0),
+        ("neck_pitch", 0.3, "pitches", [0.2, 0.31], [0.15, 0.3, -0.05]),
+        ("neck_yaw", 1.2, "yaw_limit", 1.5, 1.2),
+        ("neck_yaw", 1.2, "sweep_yaw", 1.3, 1.2),
     ],
 )
-def test_a_gaze_is_planned_within_the_robots_joints(tmp_path, joint, upper, words):
+def test_a_gaze_is_planned_within_the_robots_joints(tmp_path, joint, upper, key, chosen, clipped):
+    """Our defaults are clipped, and a line says so; what somebody has chosen is refused."""
     path = variant(tmp_path, lambda model: put(part(model, "joint", joint), "axis/limit/upper", str(upper)))
-    with pytest.raises(ConfigError) as error:
-        make_blocks(load(None, [f"robot={path}"]))
-    assert words in str(error.value)
+    scenario = load(None, [f"robot={path}"])
+    search, lines = gaze_of(scenario)
+    assert getattr(search, key) == pytest.approx(clipped)
+    assert any(line.startswith(f"valve_search.{key}: ") for line in lines)
+    used = next(block for block in make_blocks(scenario) if block.get_name() == "valve_search")
+    assert getattr(used.config, key) == pytest.approx(clipped)
+    with pytest.raises(ConfigError, match=rf"valve_search\.{key} must be within what the robot's joint can do"):
+        make_blocks(load(None, [f"robot={path}", f"valve_search.{key}={chosen}"]))
+
+
+def test_our_own_robot_looks_as_configured():
+    assert gaze_of(load()) == (load().valve_search, [])
+
+
+def test_a_grippers_effort_may_be_another_than_the_models(tmp_path):
+    def stronger(given):
+        given["grippers"]["left"]["effort"] = 123.0
+
+    robot = Robot.load(variant(tmp_path, change=stronger))
+    efforts = [robot.model.plant.GetJointActuatorByName(robot.grippers[side].joint).effort_limit() for side in SIDES]
+    ours = ROBOT.model.plant.GetJointActuatorByName(ROBOT.grippers[RIGHT].joint).effort_limit()
+    assert efforts == [123.0, ours] and ours != 123.0
 
 
 def test_sizes_and_names_of_the_whole_program_follow_the_robot(tmp_path):

@@ -29,7 +29,7 @@ from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSys
 from valve_drake.behaviors.stance_planner import StancePlanner
 from valve_drake.behaviors.stance_planner_system import StancePlannerSystem
 from valve_drake.behaviors.taught import load_taught
-from valve_drake.behaviors.valve_search import ValveSearchConfig
+from valve_drake.behaviors.valve_search import GazeLimits, ValveSearchConfig, within
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError, require
@@ -168,7 +168,7 @@ def robot_of(scenario: Scenario) -> Robot:
         for key in ("pan", "tilt"):
             require(bool(getattr(d.gaze, key)), f"gaze.{key}", "given: the search turns the eyes by it", "")
         require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
-        _check_gaze(scenario.valve_search, robot)
+        _gaze(scenario.valve_search, robot)
         high, width = scenario.command_selector.gripper_high, max(h.width for h in scenario.valve.handles)
         require(d.opening <= high, "opening", f"at most command_selector.gripper_high, {high:g}", d.opening)
         least = width + 2 * scenario.hybrid_rotation.grip_margin
@@ -178,25 +178,24 @@ def robot_of(scenario: Scenario) -> Robot:
     return robot
 
 
-def _check_gaze(search: ValveSearchConfig, robot: Robot) -> None:
-    """The gaze is planned within what the robot's joints can do. Raises ConfigError."""
+def gaze_of(scenario: Scenario) -> tuple[ValveSearchConfig, list[str]]:
+    """The search as the robot's joints can do it, and a line for each default that they cannot.
+
+    Raises ConfigError: a value that was chosen is beyond them.
+    """
+    return _gaze(scenario.valve_search, robot_of(scenario))
+
+
+def _gaze(search: ValveSearchConfig, robot: Robot) -> tuple[ValveSearchConfig, list[str]]:
     limits = dict(zip(robot.torso.names, zip(robot.torso.low.tolist(), robot.torso.high.tolist())))
-    waist, tilt, pan = robot.waist, robot.torso.names[-2], robot.torso.names[-1]
-    if robot.gaze_signs[1] < 0:  # pitches are downwards
-        low, high = limits[tilt]
-        limits[tilt] = -high, -low
+    low, high = limits[robot.torso.names[-2]]
+    pitch = (low, high) if robot.gaze_signs[1] > 0 else (-high, -low)
 
-    def symmetric(joint: str) -> tuple[float, float]:
-        low, high = limits[joint]
-        return 0.0, min(-low, high)
+    def both(joint: str) -> float:
+        return max(min(-limits[joint][0], limits[joint][1]), 0.0)
 
-    asked = [("pitch_low", limits[tilt]), ("pitch_high", limits[tilt]), ("yaw_limit", symmetric(pan))]
-    if waist is not None:
-        asked.append(("sweep_waist", symmetric(robot.torso.names[waist])))
-    for name, (low, high) in asked:
-        value = getattr(search, name)
-        words = f"within what the robot's joint can do, [{low:g}, {high:g}]"
-        require(low <= value <= high, f"valve_search.{name}", words, value)
+    waist = None if robot.waist is None else both(robot.torso.names[robot.waist])
+    return within(search, GazeLimits(pitch, both(robot.torso.names[-1]), waist))
 
 
 def start_of(scenario: Scenario) -> RobotStart | None:
@@ -306,7 +305,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
         RectangleEstimatorSystem(scenario.rectangle_estimator, head, robot.head_pose, marker),
         HandleMarkerSystem(scenario.handle_marker),
         ValveSearchSystem(
-            scenario.valve_search,
+            _gaze(scenario.valve_search, robot)[0],
             lambda base, torso: compose(robot.head_pose(base, torso), X_LEyes),
             robot.torso.home,
             robot.waist,

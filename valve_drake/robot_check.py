@@ -5,6 +5,7 @@ eyes, from where its hands turn a valve at which height and with what effort, ho
 simulated servos swing, and what is missing for each stage. The reach is asked of the same search that a run uses.
 """
 
+import contextlib
 import dataclasses as dc
 import math
 import time
@@ -24,7 +25,7 @@ from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.config import Uniform
-from valve_drake.diagram import robot_of
+from valve_drake.diagram import gaze_of, robot_of
 from valve_drake.frames import compose, inverse, planar
 from valve_drake.messages import SIDES
 from valve_drake.robot import description as descriptions
@@ -279,6 +280,9 @@ def _head(report: Report, robot: Robot, scenario: Scenario) -> None:
     for key, words in (("pan", "to the left and right"), ("tilt", "up and down")):
         if not getattr(d.gaze, key):
             report.add(MISSING, "search", f"gaze.{key}", f"no joint turns the eyes {words}: the search needs one")
+    with contextlib.suppress(ConfigError):  # what a run refuses comes last
+        for line in gaze_of(scenario)[1]:
+            report.add(NOTE, "search", "", line)
     if not (scenario.head_calibration or d.head_calibration):
         text = "none: there is no second eye without it, and the valve's place is measured with two (calibrate stereo)"
         report.add(MISSING, "search", "head_calibration", text)

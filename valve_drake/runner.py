@@ -27,7 +27,7 @@ from valve_drake.behaviors.taught import load_taught
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError, OperationFailed, require
 from valve_drake.config import key_names
-from valve_drake.diagram import System, command, deliver, listens, make_diagram, plant_of, rig_of, robot_of
+from valve_drake.diagram import System, command, deliver, gaze_of, listens, make_diagram, plant_of, rig_of, robot_of
 from valve_drake.messages import Mode, ModeState, OperatorCommand, OperatorPackets, Verdict
 from valve_drake.operator.operator_link import OperatorLink
 from valve_drake.pace import PACE, Pace, Pacer
@@ -173,6 +173,8 @@ def run(
     scenario.check()
     require(scenario.station != "replay", "station", "one that runs (a log is replayed by `replay LOG`)", "replay")
     cv2.setNumThreads(1)  # the same bits on any machine, and the renderer wants the cores
+    for line in gaze_of(scenario)[1]:
+        say(line)
     named = prepared(scenario, say)  # the log has the scenario as it was given, and the files that were used
     files = _read_files(named)  # before anything is opened: a scenario that cannot be run leaves no trace
     if scenario.station == "hardware":

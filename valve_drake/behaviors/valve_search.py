@@ -14,6 +14,7 @@ Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base w
 Sightings carry the camera's pose X_OL of their capture time: p_OV = X_OL p_LV holds in motion too. Frames: frames.py.
 """
 
+import copy
 import dataclasses as dc
 import math
 from collections.abc import Callable
@@ -78,6 +79,47 @@ class ValveSearchConfig(Config):
         require(within, f"{key}.pitches", f"within pitch_low and pitch_high, [{low:g}, {high:g}]", self.pitches)
         within = self.sweep_yaw <= self.yaw_limit
         require(within, f"{key}.sweep_yaw", f"at most yaw_limit, {self.yaw_limit:g}", self.sweep_yaw)
+
+
+@dc.dataclass(frozen=True)
+class GazeLimits:
+    """What a robot's joints can do: pitches are downwards, pan and waist go as far to both sides [rad].
+
+    waist: None for a robot without one.
+    """
+
+    pitch: tuple[float, float]
+    pan: float
+    waist: float | None
+
+
+def within(config: ValveSearchConfig, limits: GazeLimits) -> tuple[ValveSearchConfig, list[str]]:
+    """The gaze as this robot's joints can do it, and a line for every value that is not as configured.
+
+    A default is clipped; a value that was chosen is refused, by a ConfigError that names the key. A value that equals
+    the default counts as one.
+    """
+    default, fitted, notes = ValveSearchConfig(), copy.deepcopy(config), []
+    asked = [("pitch_low", limits.pitch), ("pitch_high", limits.pitch), ("pitches", limits.pitch)]
+    asked += [("yaw_limit", (0.0, limits.pan)), ("sweep_yaw", (0.0, limits.pan))]
+    if limits.waist is not None:
+        asked.append(("sweep_waist", (0.0, limits.waist)))
+    for name, (low, high) in asked:
+        value = getattr(config, name)
+        values = value if isinstance(value, list) else [value]
+        clipped = [_within(one, low, high) for one in values]
+        if clipped == values:
+            continue
+        words = f"within what the robot's joint can do, [{low:g}, {high:g}]"
+        require(value == getattr(default, name), f"{config.KEY}.{name}", words, value)
+        new = clipped if isinstance(value, list) else clipped[0]
+        setattr(fitted, name, new)
+        notes.append(f"{config.KEY}.{name}: {_said(new)} instead of {_said(value)}: what the robot's joint can do")
+    return fitted, notes
+
+
+def _said(value: float | list[float]) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else "[" + ", ".join(f"{one:.4g}" for one in value) + "]"
 
 
 @dc.dataclass(frozen=True, eq=False)

@@ -105,6 +105,7 @@ class GripperDescription(Config):
     """Key `grippers.left` or `grippers.right`: the joint that its motor moves, and the two links that press."""
 
     joint: str = plain("", "of the model; others follow it by <mimic>")
+    effort: float = number(0.0, 0.0, 1e4, "its motor's limit, at the joint; 0: the model's [N m or N]")
     pads: list[str] = names("links or frames", (2, 2))
 
     def relations(self, key: str) -> None:

@@ -106,6 +106,11 @@ def add_robot(plant: MultibodyPlant, robot: RobotDescription) -> ModelInstanceIn
             raise ConfigError(f"{key} must be a joint with one axis, got {shown(name)} ({joint.type_name()})")
         if not _has_actuator(plant, joint):
             plant.AddJointActuator(name, joint, efforts.get(name, EFFORT))
+    stronger = {robot.gripper(side).joint: robot.gripper(side).effort for side in SIDES if robot.gripper(side).effort}
+    for index in plant.GetJointActuatorIndices():  # those of one model are not known before the plant is finalized
+        actuator = plant.get_joint_actuator(index)
+        if actuator.model_instance() == model and actuator.joint().name() in stronger:
+            actuator.set_effort_limit(stronger[actuator.joint().name()])
     if robot.counterbalanced:
         plant.set_gravity_enabled(model, False)
     if any(robot.pad.size) and plant.geometry_source_is_registered():
