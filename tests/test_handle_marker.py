@@ -68,7 +68,9 @@ def test_a_handle_whose_red_and_blue_are_clipped_leaves_the_mark_in_its_place():
         X = facing(z, 0.3, 0.2, 0.0)
         drawing = Drawing(WRIST, (190, 183, 210))
         drawing.shape(frames.compose(X, frames.make(np.eye(3), np.array([-0.06, 0, 0.002]))), (8, 8, 8), (0.05, 0.03))
-        drawing.shape(frames.compose(X, frames.make(np.eye(3), np.array([0, 0, 0.001]))), (255, 232, 252), (0.09, 0.0125))
+        drawing.shape(
+            frames.compose(X, frames.make(np.eye(3), np.array([0, 0, 0.001]))), (255, 232, 252), (0.09, 0.0125)
+        )
         drawing.shape(X, (18, 182, 51), HALF)
         mark = find_mark(drawing.finish(np.random.default_rng(0), blur=0.7, noise=2.0), CONFIG)
         assert mark.found, mark.reason

@@ -23,7 +23,7 @@ WORK = [name for name in LEVELS if name[:6] in ("level1", "level2", "level3", "l
 
 
 def test_all_levels_are_there():
-    assert len(WORK) == 11
+    assert len(WORK) == 12
     assert all(scenarios.load(name) for name in LEVELS)
 
 

@@ -299,7 +299,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     stances = Stances(robot, valve, scenario.stance, view, collision.is_free)
     return [
         RobotStateSystem(robot.groups),
-        ColorSegmentationSystem(scenario.color_segmentation),
+        ColorSegmentationSystem(scenario.color_segmentation, reach=1.3 * marker.reach()),
         LineFittingSystem(scenario.line_fitting, head, marker, scenario.stereo_positioning),
         StereoPositioningSystem(scenario.stereo_positioning, head, robot.head_pose, marker),
         RectangleEstimatorSystem(scenario.rectangle_estimator, head, robot.head_pose, marker),
@@ -310,6 +310,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             robot.torso.home,
             robot.waist,
             robot.gaze_signs,
+            look=valve.look(),
         ),
         BaseApproachSystem(_clear(scenario.base_approach, robot), valve),
         StancePlannerSystem(StancePlanner(scenario.stance_planner, stances)),

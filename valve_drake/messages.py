@@ -236,6 +236,9 @@ class RectangleEstimate(Message):
     covariance: of (theta, dp) in R = R0 exp([theta]x), p = p0 + dp: theta in V, dp in L [rad^2, m^2].
     ambiguity: how much worse the mirrored candidate fits, as a difference of chi^2 (large is good).
     axis_known: the green marks or the track say which of the rectangle's axes is X.
+    angle, angle_sigma: of a marker on the panel: how far the valve is turned from the zero of its keys, as the green
+        marks beside it show, counter-clockwise for the robot, and its standard deviation [rad]; angle_seen: there were
+        any. Valves that look alike after a part of a turn leave that open: it is followed from image to image.
     """
 
     time: float = -1.0
@@ -253,6 +256,9 @@ class RectangleEstimate(Message):
     corners_right: np.ndarray = array(-1, 2)
     X_OL: np.ndarray = transform()
     reason: str = ""
+    angle: float = 0.0
+    angle_sigma: float = 0.0
+    angle_seen: bool = False
 
 
 @dc.dataclass(frozen=True, eq=False)

@@ -29,7 +29,11 @@ class Looks(Motion):
     # ------------------------------------------------------------ measure
     def _look(self, time: float, m: Memory, estimate: RectangleEstimate) -> Memory:
         """Gathers estimates whose images were taken after `since` + settle."""
-        if estimate.found and estimate.sequence != m.seen and estimate.time >= m.since + self.config.settle:
+        if (
+            self.valve.seen_by(estimate)
+            and estimate.sequence != m.seen
+            and estimate.time >= m.since + self.config.settle
+        ):
             m = changed(m, looks=(*m.looks, estimate), seen=estimate.sequence)
         return m
 
@@ -49,7 +53,7 @@ class Looks(Motion):
         past = inputs.state.history[:, 4:-2]
         if past.size and not np.max(np.ptp(past, axis=0)) <= STILL:
             return m  # lift or waist is on its way
-        X_OA = compose(fused.X_OV, self._X_VA)
+        X_OA = self.valve.place(fused.X_OV, fused.angle)
         X_BA = compose(inverse(planar(*inputs.state.odometry[:3])), X_OA)
         counted = 0.0
         if m.X_OA0 is not None:
@@ -89,9 +93,8 @@ class Looks(Motion):
         m = changed(m, phase="end")
         if not fused.found or m.X_OA0 is None:
             return self._status(m, time, "failed", Verdict.MARKER_LOST, fused.reason)
-        seen = self.seen_angle(
-            m.X_OA0, compose(fused.X_OV, self._X_VA), fused.axis_known, self._by_hands(m, inputs.turn)
-        )
+        X_OA = self.valve.place(fused.X_OV, fused.angle)
+        seen = self.seen_angle(m.X_OA0, X_OA, fused.axis_known, self._by_hands(m, inputs.turn))
         asked, tolerance = inputs.mode.turn_angle, self.config.angle_tolerance
         detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(asked):.2f} deg"
         if abs(asked - seen) <= tolerance:
@@ -110,10 +113,10 @@ class Looks(Motion):
         """
         if len(looks) < self.config.frames or looks[-1].time - looks[0].time < 0.8 * self.config.still_time:
             return None
-        poses = [compose(look.X_OL, look.X_LV, self._X_VA) for look in looks]
+        poses = [self.valve.place(compose(look.X_OL, look.X_LV), look.angle) for look in looks]
+        period = self.valve.repeats(False)
         slopes = [  # of all pairs: their median is not moved by one wrong estimate
-            # the rectangle repeats every quarter turn
-            wrap(angle_turned(poses[i], poses[k]), np.pi / 2) / (looks[k].time - looks[i].time)
+            wrap(angle_turned(poses[i], poses[k]), period) / (looks[k].time - looks[i].time)
             for k in range(len(looks))
             for i in range(k)
         ]
@@ -127,7 +130,8 @@ class Looks(Motion):
         if drift is None or m.X_OA0 is None:
             return self._status(m, time, "failed", Verdict.UNVERIFIED, f"camera does not see the marker, {hands}")
         fused = fuse(m.looks[-1:])
-        seen = self.seen_angle(m.X_OA0, compose(fused.X_OV, self._X_VA), fused.axis_known, self._by_hands(m, turn))
+        X_OA = self.valve.place(fused.X_OV, fused.angle)
+        seen = self.seen_angle(m.X_OA0, X_OA, fused.axis_known, self._by_hands(m, turn))
         camera = f"camera sees {np.degrees(seen):.2f} deg, turning by {np.degrees(drift):+.2f} deg/s"
         status = self._seen(time, m, "failed", Verdict.UNVERIFIED, f"{camera}, {hands}", seen)
         return changed(m, status=status)
@@ -137,7 +141,6 @@ class Looks(Motion):
         return Status(time, m.activation, state, verdict, detail, 1.0, angle, seen=True)
 
     def seen_angle(self, X_OA0: np.ndarray, X_OA1: np.ndarray, axis_known: bool, by_hands: float) -> float:
-        """The turned angle by camera [rad]. The rectangle repeats every quarter turn, with the green marks every half:
-        the branch nearest to what the hands felt is taken, the value is the camera's."""
-        period = np.pi if axis_known else np.pi / 2
-        return by_hands + wrap(angle_turned(X_OA0, X_OA1) - by_hands, period)
+        """The turned angle by camera [rad]. Of the angles that look alike (Valve.repeats) it is the one nearest to what
+        the hands felt; the value is the camera's."""
+        return by_hands + wrap(angle_turned(X_OA0, X_OA1) - by_hands, self.valve.repeats(axis_known))

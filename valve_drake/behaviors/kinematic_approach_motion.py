@@ -100,7 +100,7 @@ class Motion:
     ):
         config.check()
         self.config = copy.copy(config)
-        self._X_VA = valve.X_VA()
+        self.valve = valve
         self.robot = robot
         self.reference_area = reference_area
         self.home = self.robot.home

@@ -92,7 +92,7 @@ class StancePlanner:
 
     # ------------------------------------------------------------ stance
     def _stance(self, time: float, m: Memory, mode: ModeState, estimate: RectangleEstimate) -> Memory:
-        if estimate.found and (not m.looks or estimate.sequence != m.looks[-1].sequence):
+        if self.stances.valve.seen_by(estimate) and (not m.looks or estimate.sequence != m.looks[-1].sequence):
             m = changed(m, looks=(*m.looks, estimate)[-LOOKS:])
         if m.search is None:
             due = not m.stance.found or time - m.begun >= self.config.period
@@ -103,7 +103,7 @@ class StancePlanner:
             if not fused.found:
                 return m
             last = m.stance.posture if m.stance.found else None
-            X_OA, viewer = compose(fused.X_OV, self.stances.valve.X_VA()), m.looks[-1].X_OL[:2, 3]
+            X_OA, viewer = self.stances.valve.place(fused.X_OV, fused.angle), m.looks[-1].X_OL[:2, 3]
             m = changed(m, search=self.stances.begin(X_OA, mode.turn_angle, viewer, last))
         assert m.search is not None
         search = self.stances.advance(m.search)

@@ -139,6 +139,7 @@ class Memory:
     lift: np.ndarray | None = None  # where it is sent, as a stance asked for last; None: home [m, rad]
     # the marker
     target: np.ndarray | None = None  # p_OV [m]
+    aside: np.ndarray | None = None  # where it looks, off the target, in O [m]; None: at it
     target_time: float = -np.inf  # its capture time [s]
     capture_time: float = -np.inf  # of the newest sighting looked at [s]
     # search
@@ -192,9 +193,12 @@ def step(
     position: StereoPosition,
     estimate: RectangleEstimate,
     head_pose: HeadPose,
+    look: np.ndarray | None = None,
 ) -> tuple[Memory, Command, Status]:
-    """One tick of length dt -> memory, command, status."""
+    """One tick of length dt -> memory, command, status. look: where to look, off the marker's middle, in V (3,)."""
     m = memory
+    if look is not None and estimate.found and estimate.axis_known:
+        m = changed(m, aside=estimate.X_OL[:, :3] @ estimate.X_LV[:, :3] @ look)
     base = robot_state.odometry[:3]
     if not m.started:
         if len(robot_state.history) == 0:  # nothing was measured yet
@@ -237,6 +241,7 @@ def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
         goal=m.goal,
         lift=m.lift,
         target=m.target,
+        aside=m.aside,
         target_time=m.target_time,
         capture_time=m.capture_time,
         side=1.0 if gaze >= 0 else -1.0,  # the nearer end first
@@ -289,7 +294,8 @@ def _gaze(
     """Torso goal that keeps the target centred; without a target the neck stays."""
     if m.target is None:
         return np.array([0.0, *m.goal.tolist()[1:]])
-    pitch, yaw = aim(head_pose, base, np.array([waist, *m.goal.tolist()[1:]]), m.target)
+    there = m.target if m.aside is None else m.target + m.aside
+    pitch, yaw = aim(head_pose, base, np.array([waist, *m.goal.tolist()[1:]]), there)
     # The waist turns by what the neck cannot, but only while the arms are folded.
     beyond = waist + yaw - _within(waist + yaw, -config.sweep_yaw, config.sweep_yaw)
     twist = _within(beyond, -config.sweep_waist, config.sweep_waist) if driving else 0.0

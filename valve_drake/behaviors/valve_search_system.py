@@ -44,6 +44,7 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
     of them is the waist; None: the robot has none. The last two are tilt and pan. The gaze is that of waist (0 if there
     is none), tilt and pan. The lift is driven to the stance's in fine_approach, and stays there. signs: of waist, tilt
     and pan: 1 for a joint that turns it to the left, down, left as it grows (3,); None: all do.
+    look: where to look near the valve, off the marker's middle, in V (3,); None: at the marker.
     """
 
     OUTPUTS = {"command": Command, "status": Status}
@@ -55,11 +56,12 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         rest: np.ndarray,
         waist: int | None,
         signs: np.ndarray | None = None,
+        look: np.ndarray | None = None,
         name: str = "valve_search",
     ):
         config.check()
         self.config = config if waist is not None else dc.replace(config, sweep_waist=0.0)
-        self._rest, self._waist = rest, waist
+        self._rest, self._waist, self._look = rest, waist, look
         self._signs = np.ones(3) if signs is None else signs
         self._plain = waist == 0 and len(rest) == 3 and bool((self._signs > 0).all())  # the torso is the gaze
         self._whole_pose = head_pose
@@ -88,6 +90,7 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
             inputs.position,
             inputs.estimate,
             head_pose,
+            self._look,
         )
         if command.torso is not None and not self._plain:
             command = dc.replace(command, torso=self._torso(command.torso, lift))

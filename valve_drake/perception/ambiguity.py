@@ -3,6 +3,7 @@
 A small rectangle seen from afar looks nearly the same at a tilt and at its mirror image about the line of sight. Both
 minima are found (`candidates`), and the one that fits better, or that the track prefers, comes first. Which side is
 which is settled last (`settle_axis`): green marks, else sizes, else the track, else n_x > 0.
+If the marks turn about another axis than the marker does, they count wherever they are on their circles.
 """
 
 import dataclasses as dc
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 
 from valve_drake import frames
+from valve_drake.perception.mark_angle import mark_angle
 from valve_drake.perception.marker import NEXT, Marker
 from valve_drake.perception.moments import Moments
 from valve_drake.perception.paper import closed_form
@@ -32,6 +34,7 @@ class Track:
 
     X_LV: np.ndarray  # (3, 4) predicted
     axis_known: bool = False  # its X axis was settled by marks or sizes
+    angle: float = 0.0  # of a marker on the panel: how far the valve was turned [rad]
 
 
 def candidates(
@@ -173,6 +176,9 @@ def _along_y(votes: list[int]) -> bool:
 
 def _mark_votes(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker) -> list[int]:
     """Green marks found where they should be if V were this pose turned back by 0, 1, 2, 3 quarters -> 4."""
+    if marker.X_VA is not None:
+        found = [mark_angle(views, R @ turn, p, marker) for turn in _TURNS]
+        return [0 if one is None else one.marks for one in found]
     places = np.vstack([*(marker.marks @ turn.T for turn in _TURNS), np.zeros((1, 3))])
     votes = np.zeros(4, int)
     for view in views:

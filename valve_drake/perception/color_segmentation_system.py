@@ -32,6 +32,8 @@ class ColorSegmentationSystem(Block[ColorSegmentationInputs, _Memory]):
     head_right_image  in   CameraFrame
     mode              in   ModeState         how often to look
     segmentation      out  SegmentationPair
+
+    reach: how far from the marker green marks are looked for, in lengths of its side.
     """
 
     OUTPUTS = {"segmentation": SegmentationPair}
@@ -42,9 +44,10 @@ class ColorSegmentationSystem(Block[ColorSegmentationInputs, _Memory]):
         name: str = "color_segmentation",
         period: float = 1 / 8,
         delay: float = 1 / 128,
+        reach: float = 2.0,
     ):
         config.check()
-        self._config = config
+        self._config, self._reach = config, max(reach, 2.0)
         super().__init__(name, period=period, slot=3, delay=delay)
 
     def initial(self) -> _Memory:
@@ -76,17 +79,20 @@ class ColorSegmentationSystem(Block[ColorSegmentationInputs, _Memory]):
         if box is not None and all(c.rejected for c in seen.candidates):
             seen = segmented(frame, self._config)
         accepted = [c for c in seen.candidates if not c.rejected]
-        return seen, _around(accepted, frame.image.shape)
+        return seen, _around(accepted, frame.image.shape, self._reach)
 
 
-def _around(accepted: list[MarkerCandidate], shape: tuple[int, ...]) -> _Box | None:
-    """A box with even corners round all candidates, wide enough for the green marks beside them."""
+def _around(accepted: list[MarkerCandidate], shape: tuple[int, ...], far: float) -> _Box | None:
+    """A box with even corners round all candidates, wide enough for the green marks beside them.
+
+    far: how far these are, in lengths of a candidate.
+    """
     if not accepted:
         return None
     low, high = [10**6, 10**6], [0, 0]
     for c in accepted:
         size = (c.corners.max(0) - c.corners.min(0)).max()
-        reach = 2 * size + 40
+        reach = far * size + 40
         for k in (0, 1):
             low[k] = min(low[k], int(c.center[k] - reach))
             high[k] = max(high[k], int(c.center[k] + reach))

@@ -21,6 +21,7 @@ class FusedPose:
     used: int = 0  # frames that took part
     axis_known: bool = False
     reason: str = ""
+    angle: float = 0.0  # of a marker on the panel: how far the valve is turned, by the frames that show it [rad]
 
 
 def fuse(estimates: Sequence[RectangleEstimate], common: float = 0.2, gate: float = 4.0) -> FusedPose:
@@ -67,4 +68,15 @@ def fuse(estimates: Sequence[RectangleEstimate], common: float = 0.2, gate: floa
         spread=left.std(0, ddof=1) if n > 1 else np.zeros(6),
         used=n,
         axis_known=any(e.axis_known for e, k in zip(good, keep) if k),
+        angle=_mean_angle([e for e in good if e.angle_seen]),
     )
+
+
+def _mean_angle(seen: Sequence[RectangleEstimate]) -> float:
+    """Of the valve [rad]; the estimator has followed it from frame to frame. Far from the median a mark was another."""
+    if not seen:
+        return 0.0
+    angles = np.array([e.angle for e in seen])
+    off = np.abs(angles - np.median(angles))
+    weights = (off <= max(0.01, 4 * float(np.median(off)))) / np.array([e.angle_sigma**2 + 1e-6 for e in seen])
+    return float(weights @ angles / weights.sum())

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from valve_drake.checks import require
+from valve_drake.frames import apply, inverse
 
 # Corners of the unit rectangle in V in their one order: clockwise as the camera sees them (V's z points into the
 # panel). Side k joins corner k and corner k + 1: side 0 is y = -Y_w, 1 is x = +X_w, 2 is y = +Y_w, 3 is x = -X_w.
@@ -19,11 +20,14 @@ _UNIT_CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float
 class Marker:
     """The rectangle, and green marks beside it.
 
-    size: 2 X_w, 2 Y_w [m]; marks: their places in V (K, 3) [m].
+    size: 2 X_w, 2 Y_w [m]; marks: their places in V (K, 3) [m]; X_VA: of a rectangle that does not turn with the valve,
+    the valve's axis (z of A), about which the marks turn (3, 4); then `marks` are their places where the valve is at
+    zero. None: rectangle and marks turn together.
     """
 
     size: list[float] = dc.field(default_factory=lambda: [0.098, 0.100])
     marks: np.ndarray = dc.field(default_factory=lambda: MARKS.copy())
+    X_VA: np.ndarray | None = None
 
     @staticmethod
     def of(size: Sequence[float], radius: float = 0.15) -> "Marker":
@@ -41,6 +45,14 @@ class Marker:
     def corners(self) -> np.ndarray:
         """(4, 3) in V [m], clockwise as seen by the camera."""
         return _UNIT_CORNERS * [self.size[0] / 2, self.size[1] / 2, 0]
+
+    def reach(self) -> float:
+        """How far from the rectangle's middle a mark may be, in lengths of its longer side."""
+        far = float(np.linalg.norm(self.marks, axis=1).max())
+        if self.X_VA is not None:
+            p = apply(inverse(self.X_VA), self.marks)
+            far = float((np.hypot(*self.X_VA[:, 3][:2]) + np.hypot(p[:, 0], p[:, 1])).max())
+        return far / max(self.size)
 
     def aspect(self) -> float:
         """Long side over short side, >= 1."""

@@ -15,6 +15,7 @@ from valve_drake import frames
 from valve_drake.camera.lens import StereoHead
 from valve_drake.messages import MarkerEdges, RectangleEstimate
 from valve_drake.perception.ambiguity import Track, candidates, settle_axis
+from valve_drake.perception.mark_angle import mark_angle
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.matching import epipolar_offset
 from valve_drake.perception.moments import Moments, moments_of, point_residuals, robust_weights
@@ -80,6 +81,9 @@ def _estimate(
     if len(fits) > 1 and track is None and ambiguity < config.ambiguity_gate and config.method == "refined":
         covariance = covariance + _either_tilt(fit, fits[1], ambiguity)
     other = fits[1] if len(fits) > 1 else fit
+    by_marks = None
+    if marker.X_VA is not None:
+        by_marks = mark_angle(views, fit.R, fit.p, marker, track.angle if track is not None else 0.0)
     return RectangleEstimate(
         time=edges.time,
         sequence=edges.sequence,
@@ -95,6 +99,9 @@ def _estimate(
         corners_left=edges.left.corners_px if edges.left.found else np.zeros((0, 2)),
         corners_right=edges.right.corners_px if edges.right.found else np.zeros((0, 2)),
         reason=reason,
+        angle=by_marks.angle if by_marks is not None else 0.0,
+        angle_sigma=by_marks.sigma if by_marks is not None else 0.0,
+        angle_seen=by_marks is not None,
     )
 
 

@@ -21,6 +21,7 @@ class _Memory:
     X_OV: np.ndarray | None = None  # (3, 4) last estimate
     time: float = -1.0  # of that estimate's image [s]
     axis_known: bool = False
+    angle: float = 0.0  # of a marker on the panel: the valve's, when it was seen last [rad]
 
 
 class RectangleEstimatorInputs(Inputs):
@@ -73,10 +74,12 @@ class RectangleEstimatorSystem(Block[RectangleEstimatorInputs, _Memory]):
         X_OL = self._head_pose(*inputs.robot_state.head_at(edges.time))
         track = None
         if memory.X_OV is not None and edges.time - memory.time <= self._config.track_timeout:
-            track = Track(frames.compose(frames.inverse(X_OL), memory.X_OV), memory.axis_known)
+            track = Track(frames.compose(frames.inverse(X_OL), memory.X_OV), memory.axis_known, memory.angle)
         result = dc.replace(estimate(edges, self._head, self._marker, self._config, track), X_OL=X_OL)
         memory = dc.replace(memory, sequence=edges.sequence)
         if result.found:
             X_OV = frames.compose(X_OL, result.X_LV)
             memory = dc.replace(memory, X_OV=X_OV, time=edges.time, axis_known=result.axis_known)
+            if result.angle_seen:
+                memory = dc.replace(memory, angle=result.angle)
         return memory, {"estimate": result}

@@ -30,6 +30,7 @@ class View:
     lines: np.ndarray  # (4, 3)
     corners: np.ndarray  # (4, 2)
     green: np.ndarray  # (m, 2)
+    room: np.ndarray  # (m,) from each green mark's middle to the image's border [px]
     trust: np.ndarray  # (n,) 0..1: weight as a point of its own side
     information: np.ndarray  # (8, 8) of the nodes' distances [1/px^2], or zeros
 
@@ -88,9 +89,18 @@ def _view(
         lines=lines,
         corners=corners,
         green=quad.green,
+        room=_room(quad.green, lens),
         trust=trust,
         information=quad.information * min(quad.sigma / sigma, 1) ** 2,
     )
+
+
+def _room(points: np.ndarray, lens: LensModel) -> np.ndarray:
+    """From points (m, 2) to the nearest border of the image (m,) [px]."""
+    if not len(points):
+        return np.zeros(0)
+    px = lens.project(points)
+    return np.minimum(px, np.array([lens.width, lens.height]) - 1.0 - px).min(1)
 
 
 def _robust_lines(

@@ -30,7 +30,7 @@ class RobotFrames:
             (f"robot::{eye.body().name()}", "head_left", eye.GetFixedPoseInBodyFrame().GetAsMatrix34()),
             ("head_left", "head_right", head.X_LR),
         ]
-        valve = shared.shape
+        self._valve = valve = shared.shape
         self._X_VA, self._X_AV, self._X_AP = valve.X_VA(), valve.X_AV(), valve.X_AP()
         self._X_VWheel = compose(self._X_VA, self._X_AP)
         self.scene = scene(parts_of(shared.scene_graph.model_inspector()))
@@ -61,10 +61,17 @@ class RobotFrames:
         if plan.found:
             X_OA = compose(planar(*state.odometry[:3]), plan.X_BA)
         elif estimate.found:
-            X_OA = compose(estimate.X_OL, estimate.X_LV, self._X_VA)
+            X_OA = self._valve.place(compose(estimate.X_OL, estimate.X_LV), estimate.angle)
         else:
             return out
         X_now = turned(X_OA, turn.angle - plan.turned) if plan.found and turn.number == plan.number else X_OA
+        if self._valve.fixed:
+            X_O0 = X_OA if not estimate.found else compose(estimate.X_OL, estimate.X_LV, self._X_VA)
+            return out + [
+                (ODOMETRY, "valve::panel", compose(X_O0, self._X_AP)),
+                (ODOMETRY, "marker", compose(X_O0, self._X_AV)),
+                (ODOMETRY, "valve::wheel", compose(X_now, self._X_AP)),
+            ]
         return out + [
             (ODOMETRY, "marker", compose(X_now, self._X_AV)),
             ("marker", "valve::wheel", self._X_VWheel),

@@ -140,9 +140,10 @@ def _draw_finely(plant: MultibodyPlant, scene_graph: SceneGraph, valve: ModelIns
     """What is measured in images is drawn with many points a pixel, the rest with one. Before a renderer is added."""
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     assert source is not None  # the plant has its geometry there
-    body = marker_frame(plant, valve).body()
     measured = {
-        id: FINE_WITHIN.get(inspector.GetName(id).split("::")[-1], 0.0) for id in plant.GetVisualGeometriesForBody(body)
+        id: FINE_WITHIN.get(inspector.GetName(id).split("::")[-1], 0.0)
+        for name in ("wheel", "panel")
+        for id in plant.GetVisualGeometriesForBody(plant.GetBodyByName(name, valve))
     }
     for id in inspector.GetAllGeometryIds(Role.kPerception):
         properties = PerceptionProperties(inspector.GetPerceptionProperties(id))

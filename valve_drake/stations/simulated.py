@@ -169,7 +169,9 @@ class TruthSystem(PythonSystem):
         self._base = [plant.GetJointByName(j, physics.robot).position_start() for j in physics.base]
         self._bar_angle = valve.bar_angle
         self._X_WP = panel_pose(valve)
-        X = marker_frame(plant, physics.valve).GetFixedPoseInBodyFrame()
+        marker = marker_frame(plant, physics.valve)
+        self._turns = marker.body().name() == "wheel"
+        X = marker.GetFixedPoseInBodyFrame()
         self._X_LinkMarker = make(X.rotation().matrix(), X.translation())
         for name, size in self.OUTPUTS.items():
             source = self._load if name == "stem_wrench" else self._state
@@ -184,7 +186,8 @@ class TruthSystem(PythonSystem):
         output.SetFromVector(self._state.Eval(context)[self._base])
 
     def _calc_marker_pose(self, context: Context, output: BasicVector) -> None:
-        turn = make(rotation(np.array([0, 0, -self._state.Eval(context)[self._q]])), np.zeros(3))
+        angle = self._state.Eval(context)[self._q] if self._turns else 0.0
+        turn = make(rotation(np.array([0, 0, -angle])), np.zeros(3))
         output.SetFromVector(compose(self._X_WP, turn, self._X_LinkMarker).ravel())
 
     def _calc_stem_wrench(self, context: Context, output: BasicVector) -> None:

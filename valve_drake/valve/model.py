@@ -54,6 +54,7 @@ def add_valve(plant: MultibodyPlant, valve: Valve, X_VM: np.ndarray | None = Non
     wheel = frame_named(plant, model, "wheel", "valve.model: wheel").body()
     frame_named(plant, model, "panel", "valve.model: panel")
     X_PA = inverse(valve.X_AP())
+    carrier = plant.GetBodyByName("panel", model) if valve.fixed else wheel  # of the marker
     # In the file the wheel's own frame is valve_axis, with the stem at zero.
     places = {f"handle_{k + 1}": make(np.eye(3), np.array(h.xyz)) for k, h in enumerate(valve.handles)}
     places["marker"] = valve.X_AV()
@@ -61,20 +62,27 @@ def add_valve(plant: MultibodyPlant, valve: Valve, X_VM: np.ndarray | None = Non
     require(level, "valve.model", "one whose frame valve_axis is the link panel's own", valve.model)
     for name, X_AF in places.items():
         X_WheelF = compose(X_PA, X_AF)
+        body = carrier if name == "marker" else wheel
         if not plant.HasFrameNamed(name, model):
-            plant.AddFrame(FixedOffsetFrame(name, wheel.body_frame(), _rigid(X_WheelF), model))
+            plant.AddFrame(FixedOffsetFrame(name, body.body_frame(), _rigid(X_WheelF), model))
             continue
-        found = plant.GetFrameByName(name, model).GetFixedPoseInBodyFrame().GetAsMatrix34()
+        frame = plant.GetFrameByName(name, model)
+        found = frame.GetFixedPoseInBodyFrame().GetAsMatrix34()
         key = "valve.marker" if name == "marker" else f"valve.handles[{int(name[7:]) - 1}]"
+        if name == "marker":
+            own = frame.body().name()
+            require(
+                own == body.name(), "valve.marker.on", f"where valve.model has its frame marker, {own}", body.name()
+            )
         same = np.abs(found - X_WheelF).max() < ON_MODEL
         place = np.round(compose(valve.X_AP(), found)[:, 3], 4).tolist()
         require(bool(same), f"{key}.xyz", f"where valve.model has its frame {name}, {place}", X_AF[:, 3].tolist())
     X_WheelM = compose(X_PA, valve.X_AV())
     if X_VM is not None:
         X_WheelM = compose(X_WheelM, X_VM)
-        plant.AddFrame(FixedOffsetFrame("true_marker", wheel.body_frame(), _rigid(X_WheelM), model))
+        plant.AddFrame(FixedOffsetFrame("true_marker", carrier.body_frame(), _rigid(X_WheelM), model))
     at = _rigid(compose(X_WheelM, make(np.eye(3), np.array([0, 0, STICKER / 2]))))
-    plant.RegisterVisualGeometry(wheel, at, Box(*valve.marker.size, STICKER), "marker", np.array(RED))
+    plant.RegisterVisualGeometry(carrier, at, Box(*valve.marker.size, STICKER), "marker", np.array(RED))
     for k, obstacle in enumerate(valve.obstacles):
         panel = plant.GetBodyByName("panel", model)
         X = _rigid(compose(X_PA, make(np.eye(3), np.array(obstacle.xyz))))
@@ -120,14 +128,15 @@ def _made(plant: MultibodyPlant, valve: Valve) -> ModelInstanceIndex:
     # the hub, from the panel to the grip plane, and the post that carries the marker's face
     _solid(plant, wheel, RigidTransform([0, 0, -p.depth / 2 - 0.005]), Cylinder(HUB, p.depth - 0.01), "hub", DARK)
     X_face = compose(X_PA, valve.X_AV(), make(np.eye(3), np.array([0, 0, 0.003])))  # 1 mm behind the marker
-    _solid(plant, wheel, _rigid(X_face), Box(m.face, m.face, 0.004), "face", FACE)
-    foot = np.array([m.xyz[0], m.xyz[1], 0.0])
-    if math.hypot(*m.xyz[:2]) > HUB:  # an arm from the hub to below the face
+    carrier = panel if valve.fixed else wheel
+    _solid(plant, carrier, _rigid(X_face), Box(m.face, m.face, 0.004), "face", FACE)
+    foot = np.array([m.xyz[0], m.xyz[1], p.depth if valve.fixed else 0.0])
+    if math.hypot(*m.xyz[:2]) > HUB and not valve.fixed:  # an arm from the hub to below the face
         _beam(plant, wheel, X_PA, np.zeros(3), foot, 0.016, "face_arm", STEEL, solid=True)
-    rise = -m.xyz[2] - 0.005  # to within the face
+    rise = foot[2] - m.xyz[2] - 0.005  # to within the face
     if rise > 0.005:
         X_post = compose(X_PA, make(np.eye(3), foot + [0, 0, -rise / 2]))
-        _solid(plant, wheel, _rigid(X_post), Cylinder(0.02, rise), "post", STEEL)
+        _solid(plant, carrier, _rigid(X_post), Cylinder(0.02, rise), "post", STEEL)
     for k, handle in enumerate(valve.handles):
         d, xyz, w = handle.direction(), np.array(handle.xyz), handle.width
         if handle.kind == "rim":

@@ -16,9 +16,12 @@ import numpy as np
 from valve_drake.checks import require
 from valve_drake.config import Config, about, choice, number, numbers, plain
 from valve_drake.frames import compose, inverse, make, rot_x, rot_y, rot_z
+from valve_drake.messages import RectangleEstimate
 from valve_drake.perception.marker import Marker
 
 OPENING = {"counter_clockwise": 1.0, "clockwise": -1.0}  # sense that opens -> its sign about -z of A
+FARTHEST = 0.35  # of a marker on the panel from the axis [m]
+ALIKE = 0.02  # handles that differ by less look the same to the head's cameras [m]
 _UPRIGHT = 0.35  # horizontal part of an axis' direction below which it has no heading of its own
 
 
@@ -58,6 +61,11 @@ class MarkerConfig(Config):
     size: list[float] = numbers([0.098, 0.100], 0.005, 2.0, "2 X_w, 2 Y_w, along x and y of V [m]")
     xyz: list[float] = numbers([0.0, 0.0, -0.041], -1.0, 1.0, "of its centre, in A [m]")
     rpy: list[float] = numbers([0.0, 0.0, 0.0], -math.pi, math.pi, "roll, pitch, yaw of V in A [rad]")
+    on: str = choice(
+        "wheel",
+        ("wheel", "panel"),
+        "wheel: it turns with the valve; panel: it does not, and green marks tell the angle",
+    )
     face: float = number(0.15, 0.01, 2.0, "the valve's face that carries it, square [m]")
     mark_height: float = number(0.013, 0.0, 0.2, "of the green marks over the middle of their handles [m]")
 
@@ -128,6 +136,56 @@ class Valve(Config):
         require(round_, f"{key}.handles", "as far from the axis as all others on the rim", [round(r, 4) for r in rims])
         before = self.marker.xyz[2] < self.panel.depth
         require(before, f"{key}.marker.xyz", f"before the panel, z below {self.panel.depth:g}", self.marker.xyz)
+        if self.fixed:
+            off, inner = math.hypot(*self.marker.xyz[:2]), self._outermost() + math.hypot(*self.marker.size) / 2
+            words = f"at least {inner:.3g} m off the axis on a panel: nearer to it the handles pass before it"
+            require(off >= inner, f"{key}.marker.xyz", words, self.marker.xyz)
+            words = f"at most {FARTHEST:g} m off the axis on a panel: the head sees marks and marker in one image"
+            require(off <= FARTHEST, f"{key}.marker.xyz", words, self.marker.xyz)
+
+    def _outermost(self) -> float:
+        """How far from the axis the handles reach [m]."""
+        return max(math.hypot(*h.xyz[:2]) + (h.width if h.kind == "rim" else h.length) / 2 for h in self.handles)
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the marker is on the panel: then it does not turn with the valve."""
+        return self.marker.on == "panel"
+
+    def look(self) -> np.ndarray | None:
+        """Where the head looks, off the marker's middle, to see it and the marks, in V (3,) [m]; None: at it."""
+        return self.X_VA()[:, 3] / 2 if self.fixed else None
+
+    def seen_by(self, estimate: RectangleEstimate) -> bool:
+        """Whether an estimate tells how the valve is turned: of a marker on the panel, if a green mark was seen."""
+        return estimate.found and (estimate.angle_seen or not self.fixed)
+
+    def place(self, X_V: np.ndarray, angle: float) -> np.ndarray:
+        """The axis frame by the marker's pose X_V in any frame (3, 4), and the valve's angle by the green marks [rad].
+
+        The angle counts only for a marker on the panel.
+        """
+        X_A = compose(X_V, self.X_VA())
+        return turned(X_A, angle) if self.fixed else X_A
+
+    def repeats(self, axis_known: bool) -> float:
+        """The turn after which the valve looks the same to the cameras [rad].
+
+        The rectangle repeats every quarter turn, with green marks that tell its axis every half. Of a marker on the
+        panel the marks alone count.
+        """
+        if self.fixed:
+            return 2 * math.pi / self._folds()
+        return math.pi if axis_known else math.pi / 2
+
+    def _folds(self) -> int:
+        """How many turns about the axis bring handles to handles; 1: a whole one alone."""
+        places = np.array([handle.xyz for handle in self.handles])
+        for count in range(len(places), 1, -1):
+            there = places @ rot_z(2 * math.pi / count).T
+            if np.linalg.norm(there[:, None] - places[None], axis=2).min(1).max() < ALIKE:
+                return count
+        return 1
 
     @property
     def sense(self) -> float:
@@ -135,7 +193,7 @@ class Valve(Config):
         return OPENING[self.opens]
 
     def X_AV(self) -> np.ndarray:
-        """The marker's frame in A -> (3, 4)."""
+        """The marker's frame in A -> (3, 4); of a marker on the panel, with the stem at zero."""
         roll, pitch, yaw = self.marker.rpy
         level = not any(self.marker.rpy)
         R = np.eye(3) if level else rot_z(yaw) @ rot_y(pitch) @ rot_x(roll)
@@ -149,10 +207,10 @@ class Valve(Config):
         return make(np.eye(3), np.array([0.0, 0.0, self.panel.depth]))
 
     def target(self) -> Marker:
-        """What the head's cameras look for: the rectangle and the green marks, in V."""
+        """What the head's cameras look for: the rectangle and the green marks, in V, with the stem at zero."""
         X_VA, up = self.X_VA(), np.array([0.0, 0.0, -self.marker.mark_height])
         marks = [X_VA[:, :3] @ (np.array(handle.xyz) + up) + X_VA[:, 3] for handle in self.handles]
-        return Marker(list(self.marker.size), np.round(np.array(marks), 12))
+        return Marker(list(self.marker.size), np.round(np.array(marks), 12), X_VA if self.fixed else None)
 
     def grasp(self, handle: int, sign: float) -> np.ndarray:
         """X_AG of a hand at a handle -> (3, 4): z_G into the panel, x_G along the handle, its direction times `sign`.
