@@ -9,8 +9,10 @@ from robot_facts import ROBOT
 from valve_drake import diagram, yaml_file
 from valve_drake import scenario as scenarios
 from valve_drake.behaviors.blind_servo import STRAIGHT, BlindServo, Memory
-from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances, standoff
+from valve_drake.behaviors.grasp_geometry import Turn, standoff
 from valve_drake.behaviors.image_servo import ImageServoConfig
+from valve_drake.behaviors.stance_config import StanceConfig
+from valve_drake.behaviors.stance_search import Stances
 from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, inverse, make, planar, rotation
 from valve_drake.messages import SIDES, CameraFrame, GraspPlan, Mode, ModeState, RobotState
@@ -33,7 +35,7 @@ def at_the_valve(robot: Robot):
     place, _ = stances.find(X_OA, np.pi / 2, np.array([-2.0, 0.0]))
     posture = robot.posture.home if place.posture is None else place.posture
     X_BA = compose(inverse(planar(*place.base)), X_OA)
-    arc = stances.best_arc(X_BA, np.pi / 2, posture=posture)
+    arc = stances.best_arc(Turn(X_BA, np.pi / 2, posture=posture))
     grasps = {side: compose(X_BA, VALVE.grasp(arc.grasps[side].handle, arc.grasps[side].sign)) for side in SIDES}
     return grasps, arc.q, X_BA, posture
 

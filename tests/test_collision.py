@@ -6,7 +6,9 @@ from robot_facts import ARMS_HOME as HOME
 from robot_facts import ROBOT
 from robot_variants import variant
 
-from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances, standoff
+from valve_drake.behaviors.grasp_geometry import Turn, standoff
+from valve_drake.behaviors.stance_config import StanceConfig
+from valve_drake.behaviors.stance_search import Stances
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, inverse, make, planar
@@ -41,7 +43,7 @@ def X_BA():
 
 def arms(X_BA: np.ndarray, *, back: float = 0.0, aside=(0.0, 0.0, 0.0)) -> np.ndarray:
     """Both hands on their handles, drawn back from the panel by `back` and moved by `aside` (in the hand) [m]."""
-    arc = stances(StanceConfig()).best_arc(X_BA, np.pi / 2)
+    arc = stances(StanceConfig()).best_arc(Turn(X_BA, np.pi / 2))
     q = []
     for side, near in arc.q.items():
         X_BG = standoff(

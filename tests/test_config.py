@@ -16,7 +16,8 @@ from robot_facts import ROBOT
 
 from valve_drake import cli, config, resources
 from valve_drake import scenario as scenarios
-from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances
+from valve_drake.behaviors.stance_config import StanceConfig
+from valve_drake.behaviors.stance_search import Stances
 from valve_drake.checks import ConfigError
 from valve_drake.config import Config, Number, Uniform, number, numbers, plain, table
 from valve_drake.frames import make, rot_x, rot_y

@@ -7,11 +7,9 @@ import pytest
 from robot_facts import ROBOT
 
 from valve_drake import resources
-from valve_drake.behaviors.grasp_geometry import (
-    StanceConfig,
-    Stances,
-    standoff,
-)
+from valve_drake.behaviors.grasp_geometry import Turn, standoff
+from valve_drake.behaviors.stance_config import StanceConfig
+from valve_drake.behaviors.stance_search import Stances
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, compose, inverse, make, planar, rotation, wrap
@@ -126,7 +124,7 @@ def test_a_comfortable_stance_exists_over_the_whole_range(height, tilt, bar, tur
     assert ROBOT.stand[0] - 1e-9 <= off @ forward <= ROBOT.stand[1] + 1e-9
     # and it holds what it says, along the arc at a finer step
     X_BA = compose(inverse(planar(*base)), X_OA)
-    fine = stances(arc_step=0.02).best_arc(X_BA, np.deg2rad(turn))
+    fine = stances(arc_step=0.02).best_arc(Turn(X_BA, np.deg2rad(turn)))
     assert fine.margin > margin - 0.1
 
 
@@ -148,10 +146,10 @@ def test_a_turn_that_one_grasp_does_not_reach_is_made_of_several(turn):
     base, margin = stance(X_OA, turn, distance_min=0.72, distance_max=0.76)
     assert margin > 0.15
     dut, left, X_BA = stances(), np.deg2rad(turn), compose(inverse(planar(*base)), X_OA)
-    assert dut.best_arc(X_BA, left).turn != pytest.approx(left)
+    assert dut.best_arc(Turn(X_BA, left)).turn != pytest.approx(left)
     arcs = []
     while abs(left) > 1e-9:
-        arcs.append(dut.best_arc(X_BA, left))
+        arcs.append(dut.best_arc(Turn(X_BA, left)))
         X_BA, left = turned(X_BA, arcs[-1].turn), left - arcs[-1].turn
         assert len(arcs) <= 12
     assert all(arc.margin >= CONFIG.margin_min for arc in arcs)
@@ -163,7 +161,7 @@ def test_the_arc_says_where_it_starts_and_that_the_whole_of_it_is_reached():
     X_OA = valve_at(1.0)
     base, _ = stance(X_OA, 90, distance_min=0.70, distance_max=0.76)
     X_BA = compose(inverse(planar(*base)), X_OA)
-    arc = stances().best_arc(X_BA, np.pi / 2)
+    arc = stances().best_arc(Turn(X_BA, np.pi / 2))
     for side, q in arc.q.items():
         X_BG = ROBOT.forward(side, q)
         assert X_BG == pytest.approx(
@@ -171,20 +169,67 @@ def test_the_arc_says_where_it_starts_and_that_the_whole_of_it_is_reached():
         )
     # too near and too far are worse, and further it is out of reach
     margins = [
-        stances().best_arc(compose(make(np.eye(3), np.array([d, 0, 0])), X_BA), np.pi / 2).margin
+        stances().best_arc(Turn(compose(make(np.eye(3), np.array([d, 0, 0])), X_BA), np.pi / 2)).margin
         for d in (0.0, 0.12, 0.20, 0.40)
     ]
     assert 0 < margins[0] < margins[1] > margins[2] and margins[3] == -1
 
 
+def searched(dut: Stances, search):
+    """The search at its end, and how many portions it took."""
+    portions = 0
+    while not search.done:
+        search, portions = dut.advance(search), portions + 1
+    return search, portions
+
+
+def test_a_place_that_took_long_to_find_is_tried_first_when_the_valve_is_measured_again():
+    """Of a valve that lies flat, where no place is comfortable, the whole of the search is made but once."""
+    dut = stances(distance_min=0.5, distance_max=0.54)
+    X_OA, viewer = valve_at(0.75, tilt=90.0), np.array([0.7, 0.4])
+    first, long = searched(dut, dut.begin(X_OA, np.pi / 2, viewer))
+    assert CONFIG.margin_min < first.margin < CONFIG.margin_good
+    again = make(X_OA[:, :3], X_OA[:, 3] + [0.01, -0.02, 0.0])
+    second, short = searched(dut, dut.begin(again, np.pi / 2, viewer, first))
+    assert short < long / 5
+    assert second.best.base == pytest.approx(first.best.base + [0.01, -0.02, 0.0])
+    assert second.margin == pytest.approx(first.margin, abs=0.01)
+    # where it serves no longer, all is searched
+    blocked = stances(
+        lambda X_BA, q, posture=None: X_BA is None or X_BA[2, 3] < 0.7, distance_min=0.5, distance_max=0.54
+    )
+    third, steps = searched(blocked, blocked.begin(again, np.pi / 2, viewer, first))
+    assert third.margin < 0 and steps > short
+
+
+def test_the_place_before_turns_with_the_heading_of_the_valve():
+    """A valve in a corner, turned from a step aside."""
+    X_OA = valve_at(1.0)
+    left = np.array([-np.sin(0.3), np.cos(0.3)])
+
+    def is_free(X_BA, q, posture=None):
+        return X_BA is None or X_BA[1, 3] < -0.05  # only from the left of the valve
+
+    dut = stances(is_free, distance_min=0.7, distance_max=0.78)
+    first, long = searched(dut, dut.begin(X_OA, np.pi / 2, np.zeros(2)))
+    assert first.found_in == 1 and (first.best.base[:2] - X_OA[:2, 3]) @ left > 0.1
+    yawed = compose(make(rotation(np.array([0, 0, 0.05])), np.array([0.0, 0, 0])), X_OA)
+    second, short = searched(dut, dut.begin(yawed, np.pi / 2, np.zeros(2), first))
+    assert short < long
+    before = compose(inverse(planar(*first.best.base)), X_OA)
+    assert compose(inverse(planar(*second.best.base)), yawed) == pytest.approx(before, abs=1e-9)
+
+
 def test_handles_are_shared_the_better_way():
     """A valve turned by half a turn looks the same with its ends exchanged: the hands must not cross."""
     X_BA = compose(inverse(planar(1.2, 0.4, 0.3)), valve_at(1.0))
-    straight = stances().best_arc(X_BA, np.pi / 2)
-    other = stances().best_arc(turned(X_BA, np.pi), np.pi / 2)
+    straight = stances().best_arc(Turn(X_BA, np.pi / 2))
+    other = stances().best_arc(Turn(turned(X_BA, np.pi), np.pi / 2))
     assert straight.grasps["left"].handle == other.grasps["right"].handle == 1
     assert all(straight.q[side] == pytest.approx(other.q[side]) for side in SIDES)
-    crossed = stances().check_arc(X_BA, np.pi / 2, {"left": straight.grasps["right"], "right": straight.grasps["left"]})
+    crossed = stances().check_arc(
+        Turn(X_BA, np.pi / 2), {"left": straight.grasps["right"], "right": straight.grasps["left"]}
+    )
     assert crossed.margin < straight.margin
 
 
@@ -214,11 +259,11 @@ def test_arms_that_touch_something_where_they_draw_back_have_no_stance():
     X_OV = valve_at(1.0)
     base, _ = stance(X_OV, 90, distance_min=0.76, distance_max=0.78)
     X_BA = compose(inverse(planar(*base)), X_OV)
-    arc = stances().best_arc(X_BA, np.pi / 2)
+    arc = stances().best_arc(Turn(X_BA, np.pi / 2))
     back = np.concatenate([arc.q_standoff[side] for side in SIDES])
     blocked = stances(lambda X_BA, q, posture=None: not np.allclose(q, back))
     assert arc.margin > 0.5
-    assert blocked.check_arc(X_BA, np.pi / 2, arc.grasps).margin == -1
+    assert blocked.check_arc(Turn(X_BA, np.pi / 2), arc.grasps).margin == -1
 
 
 @pytest.mark.parametrize("share", [0.0, 1 / 6, 0.5, 5 / 6, 1.0])
@@ -227,10 +272,10 @@ def test_arms_that_touch_anywhere_along_the_turn_cannot_make_it(share):
     base, _ = stance(X_OA, 90, distance_min=0.76, distance_max=0.78)
     X_BA = compose(inverse(planar(*base)), X_OA)
     there = turned(X_BA, share * np.pi / 2)
-    arc = stances().best_arc(X_BA, np.pi / 2)
+    arc = stances().best_arc(Turn(X_BA, np.pi / 2))
     blocked = stances(lambda X_BA, q, posture=None: not np.allclose(X_BA, there))
     assert arc.margin > 0.5
-    assert blocked.check_arc(X_BA, np.pi / 2, arc.grasps).margin == -1
+    assert blocked.check_arc(Turn(X_BA, np.pi / 2), arc.grasps).margin == -1
 
 
 def test_a_redundant_arm_that_is_not_comfortable_begins_from_other_postures_too():
@@ -238,9 +283,10 @@ def test_a_redundant_arm_that_is_not_comfortable_begins_from_other_postures_too(
     X_OA = compose(panel_pose(ValveConfig(height=1.22)), inverse(VALVE.X_AP()))
     X_BA, high = compose(inverse(planar(-0.88, 0, 0)), X_OA), pr2.posture.high
     search = Stances(pr2, VALVE, CONFIG, VIEW, lambda *_: True)
-    arc = search.best_arc(X_BA, np.pi / 2, posture=high)
+    turn = Turn(X_BA, np.pi / 2, high)
+    arc = search.best_arc(turn)
     angles = np.linspace(0, np.pi / 2, 7)
-    first = [min(search._follow(X_BA, angles, side, arc.grasps[side], None, -1.0, high)[1]) for side in SIDES]
+    first = [min(search._follow(turn, angles, side, arc.grasps[side], None, -1.0)[1]) for side in SIDES]
     assert min(first) < 0.2 < 0.25 < arc.margin
 
 
@@ -253,8 +299,8 @@ def test_grasps_that_do_not_follow_a_turn_to_its_end_turn_as_far_as_they_reach()
         return bool(np.arcsin(np.clip(X_BA[2, 0], -1, 1)) < 0.99)
 
     dut = stances(before_a_radian)
-    assert dut.best_arc(X_BA, 1.5).margin < 0
-    arc = dut.best_arc(X_BA, 1.5, split=True)
+    assert dut.best_arc(Turn(X_BA, 1.5)).margin < 0
+    arc = dut.best_arc(Turn(X_BA, 1.5, split=True))
     assert 0.4 <= arc.turn < 1.0 and arc.margin >= CONFIG.margin_min
-    assert stances().best_arc(X_BA, 1.5).turn == pytest.approx(1.5)
+    assert stances().best_arc(Turn(X_BA, 1.5)).turn == pytest.approx(1.5)
     assert dut.find(X_OA, 1.5)[1] < 0  # but then the turn is not made, from anywhere

@@ -13,10 +13,12 @@ from robot_facts import ROBOT
 
 from valve_drake.behaviors import hybrid_rotation_turn
 from valve_drake.behaviors.closed_chain import contact_wrench, gravity_wrench, make_chain, turn_rate, twists
-from valve_drake.behaviors.grasp_geometry import StanceConfig, Stances
+from valve_drake.behaviors.grasp_geometry import Turn
 from valve_drake.behaviors.hybrid_rotation import HybridRotation, Memory
 from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
+from valve_drake.behaviors.stance_config import StanceConfig
+from valve_drake.behaviors.stance_search import Stances
 from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, cross, inverse, make, planar, rot_y, rot_z, rotation, rotation_vector
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, GraspPlan, Mode, ModeState, RobotState, Status
@@ -843,7 +845,7 @@ def test_a_redundant_arm_keeps_to_the_way_that_was_planned():
     pr2 = Robot.load(description.find("pr2/pr2.robot.yaml"))
     X_OA = compose(panel_pose(ValveConfig(height=1.17)), inverse(VALVE.X_AP()))
     X_BA, posture = compose(inverse(planar(-0.85, 0, 0)), X_OA), np.array([0.23])
-    arc = Stances(pr2, VALVE, StanceConfig(), VIEW, lambda *_: True).best_arc(X_BA, QUARTER, posture=posture)
+    arc = Stances(pr2, VALVE, StanceConfig(), VIEW, lambda *_: True).best_arc(Turn(X_BA, QUARTER, posture=posture))
     both = {name: np.hstack([getattr(arc, name)[side] for side in SIDES]).ravel() for name in ("q_standoff", "way")}
     law = HybridRotation(CONFIG, VALVE, pr2, VIEW)
     off = {}

@@ -12,11 +12,7 @@ from robot_facts import LIMITS, ROBOT
 
 from valve_drake import resources
 from valve_drake.behaviors import stance_planner
-from valve_drake.behaviors.grasp_geometry import (
-    StanceConfig,
-    Stances,
-    standoff,
-)
+from valve_drake.behaviors.grasp_geometry import Turn, pairs, standoff
 from valve_drake.behaviors.kinematic_approach import (
     NOT_OWNED,
     Inputs,
@@ -25,8 +21,10 @@ from valve_drake.behaviors.kinematic_approach import (
     Memory,
 )
 from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
+from valve_drake.behaviors.stance_config import StanceConfig
 from valve_drake.behaviors.stance_planner import StancePlanner, StancePlannerConfig
 from valve_drake.behaviors.stance_planner_system import PERIOD, StancePlannerSystem
+from valve_drake.behaviors.stance_search import Stances
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
@@ -742,8 +740,8 @@ def test_the_lift_is_chosen_where_the_arms_alone_do_not_reach(tmp_path):
     assert lifted.posture.home[0] == pytest.approx(low) or heights[0] == pytest.approx(low)
     raised = places[1][-1].posture
     X_BA = compose(inverse(planar(*places[0][0].base)), X_OA)
-    grasps = next(stances.pairs(X_BA, 0.3))[0]
-    low_arc = stances.check_arc(X_BA, 0.3, grasps)
+    grasps = next(pairs(stances.valve, X_BA, 0.3))[0]
+    low_arc = stances.check_arc(Turn(X_BA, 0.3), grasps)
     up = make(X_BA[:, :3], X_BA[:, 3] + [0, 0, raised[0] - lifted.posture.home[0]])
-    high_arc = stances.check_arc(up, 0.3, grasps, posture=raised)
+    high_arc = stances.check_arc(Turn(up, 0.3, posture=raised), grasps)
     assert high_arc.margin == pytest.approx(low_arc.margin, abs=1e-3)  # the valve and the shoulders are as high

@@ -9,7 +9,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from valve_drake import named_files, resources
 from valve_drake import scenario as scenarios
-from valve_drake.behaviors.grasp_geometry import Stances
+from valve_drake.behaviors.grasp_geometry import Turn
+from valve_drake.behaviors.stance_search import Stances
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
@@ -39,7 +40,7 @@ def test_a_level_has_a_stance_from_which_its_turn_is_made_and_its_valve_turns_as
     assert margin > 0.3
     X_BA, left = compose(inverse(planar(*place.base)), X_OA), scenario.angle
     while left > 1e-9:
-        arc = stances.best_arc(X_BA, left, posture=place.posture)
+        arc = stances.best_arc(Turn(X_BA, left, posture=place.posture))
         assert arc.turn > 0.3 or arc.turn == pytest.approx(left)
         X_BA, left = turned(X_BA, arc.turn), left - arc.turn
     builder = DiagramBuilder()

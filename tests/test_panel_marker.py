@@ -28,7 +28,7 @@ UNEVEN = "{xyz: [0.15, 0, 0]}, {xyz: [-0.075, 0.13, 0]}, {xyz: [0, -0.12, 0]}"
 
 
 def valve(handles: str = BAR, marker: str = "xyz: [0, -0.24, 0.085]") -> Valve:
-    text = f"valve: {{model: '', marker: {{on: panel, size: [0.08, 0.08], {marker}}}, handles: [{handles}]}}"
+    text = f"valve: {{model: '', marker: {{carrier: panel, size: [0.08, 0.08], {marker}}}, handles: [{handles}]}}"
     scenario = scenarios.parse(text, "a file")
     scenario.check()
     return scenario.valve
@@ -143,7 +143,9 @@ def test_a_marker_that_handles_pass_before_or_that_is_too_far_off_is_refused(mar
 
 
 def test_a_model_with_its_marker_on_the_wheel_is_refused():
-    scenario = scenarios.parse("valve: {marker: {on: panel, xyz: [0, -0.26, 0.085]}}", "a file")
+    scenario = scenarios.parse("valve: {marker: {carrier: panel, xyz: [0, -0.26, 0.085]}}", "a file")
     scenario.check()
-    with pytest.raises(ConfigError, match=r"valve\.marker\.on must be where valve\.model has its frame marker, wheel"):
+    with pytest.raises(
+        ConfigError, match=r"valve\.marker\.carrier must be where valve\.model has its frame marker, wheel"
+    ):
         add_valve(MultibodyPlant(0.0), scenario.valve)

@@ -19,7 +19,7 @@ from valve_drake import named_files
 from valve_drake.behaviors.base_approach import BaseApproachConfig
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.behaviors.blind_servo import STRAIGHT, BlindServo
-from valve_drake.behaviors.grasp_geometry import Stances
+from valve_drake.behaviors.grasp_geometry import Turn
 from valve_drake.behaviors.hybrid_rotation import HybridRotation
 from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
 from valve_drake.behaviors.image_servo import ImageServo
@@ -28,6 +28,7 @@ from valve_drake.behaviors.kinematic_approach import KinematicApproach
 from valve_drake.behaviors.kinematic_approach_system import KinematicApproachSystem
 from valve_drake.behaviors.stance_planner import StancePlanner
 from valve_drake.behaviors.stance_planner_system import StancePlannerSystem
+from valve_drake.behaviors.stance_search import Stances
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.behaviors.valve_search import GazeLimits, ValveSearchConfig, within
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
@@ -209,7 +210,7 @@ def start_of(scenario: Scenario) -> RobotStart | None:
     along = dict.fromkeys(SIDES, np.array([0.0, 0.0, 1.0]))  # how the wrist cameras look is not known without a lesson
     stances = Stances(robot, valve, scenario.stance, along, CollisionModel(robot).is_free)
     place, margin = stances.find(X_WA, scenario.angle)
-    arc = stances.best_arc(compose(inverse(planar(*place.base)), X_WA), scenario.angle, posture=place.posture)
+    arc = stances.best_arc(Turn(compose(inverse(planar(*place.base)), X_WA), scenario.angle, place.posture))
     if margin < 0 or not arc.q:
         raise ConfigError(f"the hands do not reach the handles of a valve at {simulation.valve.height:g} m")
     torso = robot.torso.home.copy()

@@ -19,7 +19,9 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.sensors import CameraInfo
 
 from valve_drake import named_files
-from valve_drake.behaviors.grasp_geometry import Place, StanceConfig, Stances
+from valve_drake.behaviors.grasp_geometry import Turn
+from valve_drake.behaviors.stance_config import StanceConfig
+from valve_drake.behaviors.stance_search import Place, Stances
 from valve_drake.behaviors.taught import load_made_for, load_taught
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError
@@ -539,7 +541,7 @@ def _judge_reach(report: Report, spec: StanceConfig, own: set[float]) -> None:
 
 def _effort(report: Report, robot: Robot, stances: Stances, X_BA: np.ndarray, place: Place) -> tuple[float, str]:
     """The largest share of an effort limit along the turn, by weight and the hands' push, and whose it is."""
-    arc = stances.best_arc(X_BA, TURN, posture=place.posture)
+    arc = stances.best_arc(Turn(X_BA, TURN, place.posture))
     if not arc.q:
         return math.nan, ""
     plant, index, limits = robot.model.plant, robot.model.robot, _limits(robot.model.plant)
@@ -670,7 +672,7 @@ def _pictures(
         return
     X_WA = compose(panel_pose(valve), inverse(scenario.valve.X_AP()))
     stances = _stances(robot, scenario, CollisionModel(robot))
-    arc = stances.best_arc(compose(inverse(planar(*place.base)), X_WA), TURN, posture=place.posture)
+    arc = stances.best_arc(Turn(compose(inverse(planar(*place.base)), X_WA), TURN, place.posture))
     torso = robot.torso.home.copy()
     if place.posture is not None:
         torso[: len(place.posture)] = place.posture

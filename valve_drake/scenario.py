@@ -16,10 +16,10 @@ import numpy as np
 
 from valve_drake import config, resources, yaml_file
 from valve_drake.behaviors.base_approach import BaseApproachConfig
-from valve_drake.behaviors.grasp_geometry import StanceConfig
 from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.image_servo import ImageServoConfig
 from valve_drake.behaviors.kinematic_approach import KinematicApproachConfig
+from valve_drake.behaviors.stance_config import StanceConfig
 from valve_drake.behaviors.stance_planner import StancePlannerConfig
 from valve_drake.behaviors.valve_search import ValveSearchConfig
 from valve_drake.checks import ConfigError, require, shown

@@ -13,8 +13,10 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.behaviors.grasp_geometry import Arc, ArcSearch, Stances, StanceSearch, standoff
+from valve_drake.behaviors.arc_search import ArcSearch
+from valve_drake.behaviors.grasp_geometry import Arc, Turn, standoff
 from valve_drake.behaviors.joint_path import PathSearch
+from valve_drake.behaviors.stance_search import Stances, StanceSearch
 from valve_drake.config import Config, number
 from valve_drake.frames import compose
 from valve_drake.memory import changed
@@ -53,6 +55,7 @@ class Memory:
     activation: int = -1
     looks: tuple[RectangleEstimate, ...] = ()
     search: StanceSearch | None = None
+    last: StanceSearch | None = None  # the one before, if it has found a stance
     searched: RectangleEstimate = RectangleEstimate()  # the newest estimate that `search` is made from
     begun: float = -1e9  # when the last search for a stance began [s]
     stance: Stance = Stance()
@@ -80,7 +83,7 @@ class StancePlanner:
         """One portion -> memory, with stance, grasps and path in it. A request comes before the stance."""
         m = memory
         if mode.mode == Mode.SEARCH and m.activation != mode.activation:
-            m = changed(m, stance=Stance(), looks=(), search=None, begun=-1e9)
+            m = changed(m, stance=Stance(), looks=(), search=None, last=None, begun=-1e9)
         m = changed(m, activation=mode.activation) if m.activation != mode.activation else m
         if request.number != m.number:
             return self._take(m, request)
@@ -102,9 +105,8 @@ class StancePlanner:
             m = changed(m, searched=m.looks[-1], begun=time)
             if not fused.found:
                 return m
-            last = m.stance.posture if m.stance.found else None
             X_OA, viewer = self.stances.valve.place(fused.X_OV, fused.angle), m.looks[-1].X_OL[:2, 3]
-            m = changed(m, search=self.stances.begin(X_OA, mode.turn_angle, viewer, last))
+            m = changed(m, search=self.stances.begin(X_OA, mode.turn_angle, viewer, m.last))
         assert m.search is not None
         search = self.stances.advance(m.search)
         if not search.done:
@@ -116,14 +118,14 @@ class StancePlanner:
         if best is not None:
             posture = self.robot.posture.home if best.posture is None else best.posture
             stance = dc.replace(stance, base=best.base, posture=posture)
-        return changed(m, search=None, stance=stance)
+        return changed(m, search=None, last=search if good else None, stance=stance)
 
     # ------------------------------------------------------------ requests
     def _take(self, m: Memory, request: PlanRequest) -> Memory:
         """A new request: the one before is dropped."""
         m = changed(m, number=request.number, path_search=None, arc_search=None)
         if request.kind == "grasps":
-            search = self.stances.begin_arc(request.X_BA, request.turn_angle, posture=request.posture)
+            search = self.stances.begin_arc(Turn(request.X_BA, request.turn_angle, request.posture, split=True))
             return changed(m, arc_search=search)
         if request.kind == "path":
             return changed(m, path_search=PathSearch(request.start, request.goal), vias_left=request.valve)

@@ -72,7 +72,10 @@ def add_valve(plant: MultibodyPlant, valve: Valve, X_VM: np.ndarray | None = Non
         if name == "marker":
             own = frame.body().name()
             require(
-                own == body.name(), "valve.marker.on", f"where valve.model has its frame marker, {own}", body.name()
+                own == body.name(),
+                "valve.marker.carrier",
+                f"where valve.model has its frame marker, {own}",
+                body.name(),
             )
         same = np.abs(found - X_WheelF).max() < ON_MODEL
         place = np.round(compose(valve.X_AP(), found)[:, 3], 4).tolist()

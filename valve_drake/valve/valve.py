@@ -61,7 +61,7 @@ class MarkerConfig(Config):
     size: list[float] = numbers([0.098, 0.100], 0.005, 2.0, "2 X_w, 2 Y_w, along x and y of V [m]")
     xyz: list[float] = numbers([0.0, 0.0, -0.041], -1.0, 1.0, "of its centre, in A [m]")
     rpy: list[float] = numbers([0.0, 0.0, 0.0], -math.pi, math.pi, "roll, pitch, yaw of V in A [rad]")
-    on: str = choice(
+    carrier: str = choice(
         "wheel",
         ("wheel", "panel"),
         "wheel: it turns with the valve; panel: it does not, and green marks tell the angle",
@@ -150,7 +150,7 @@ class Valve(Config):
     @property
     def fixed(self) -> bool:
         """Whether the marker is on the panel: then it does not turn with the valve."""
-        return self.marker.on == "panel"
+        return self.marker.carrier == "panel"
 
     def look(self) -> np.ndarray | None:
         """Where the head looks, off the marker's middle, to see it and the marks, in V (3,) [m]; None: at it."""
