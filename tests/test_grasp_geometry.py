@@ -7,9 +7,11 @@ import pytest
 from robot_facts import ROBOT
 
 from valve_drake import resources
+from valve_drake.behaviors import arc_search
 from valve_drake.behaviors.grasp_geometry import Turn, standoff
+from valve_drake.behaviors.questions import UNITS, Questions
 from valve_drake.behaviors.stance_config import StanceConfig
-from valve_drake.behaviors.stance_search import Stances
+from valve_drake.behaviors.stance_search import FEW, Stances
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, compose, inverse, make, planar, rotation, wrap
@@ -286,8 +288,67 @@ def test_a_redundant_arm_that_is_not_comfortable_begins_from_other_postures_too(
     turn = Turn(X_BA, np.pi / 2, high)
     arc = search.best_arc(turn)
     angles = np.linspace(0, np.pi / 2, 7)
-    first = [min(search._follow(turn, angles, side, arc.grasps[side], None, -1.0)[1]) for side in SIDES]
+    first = [min(search._follow(turn, angles, side, arc.grasps[side], None, -1.0, Questions())[1]) for side in SIDES]
     assert min(first) < 0.2 < 0.25 < arc.margin
+
+
+def test_a_redundant_arms_search_asks_little_in_a_portion_and_finds_the_same(monkeypatch):
+    """Robot and collision checker are asked at most UNITS questions in one, however long the whole takes."""
+    pr2, asked = Robot.load(description.find("pr2/pr2.robot.yaml")), []
+
+    class Counted:
+        def __getattr__(self, name):
+            return getattr(pr2, name)
+
+        def inverse(self, *args):
+            asked.append("inverse")
+            return pr2.inverse(*args)
+
+    def is_free(*_):
+        asked.append("free")
+        return True
+
+    search = Stances(Counted(), VALVE, CONFIG, VIEW, is_free)
+    X_OA = compose(panel_pose(ValveConfig(height=1.1)), inverse(VALVE.X_AP()))
+    X_BA = compose(inverse(planar(-0.88, 0, 0)), X_OA)
+
+    def best():
+        state, most = search.begin_arc(Turn(X_BA, np.pi / 2)), 0
+        while not state.done:
+            before = len(asked)
+            state = search.advance_arc(state)
+            most = max(most, len(asked) - before)
+        return state.best, most
+
+    cut, most = best()
+    monkeypatch.setattr(arc_search, "UNITS", np.inf)
+    whole, all_of_a_pair = best()
+    assert most <= UNITS < all_of_a_pair
+    assert cut.margin == whole.margin and cut.way["left"].tolist() == whole.way["left"].tolist()
+
+
+def test_where_a_robot_may_stand_at_many_distances_a_few_are_tried_first():
+    wide = stances(distance_min=0.6, distance_max=1.2)
+    search = wide.begin(valve_at(1.0), np.pi / 2, np.zeros(2))
+    first, last = search.places[0], search.places[search.dense]
+    assert len(first) <= FEW < len(last) == 31
+    assert {tuple(place.base) for place in first} <= {tuple(place.base) for place in last}
+    narrow = stances().begin(valve_at(1.0), np.pi / 2, np.zeros(2))
+    assert narrow.dense == len(narrow.places)
+
+
+def test_places_between_are_tried_where_none_of_the_few_serves():
+    X_OA = valve_at(1.0)
+    wide = stances(distance_min=0.6, distance_max=1.2)
+    search = wide.begin(X_OA, np.pi / 2, np.zeros(2))
+    few = [np.linalg.norm(place.base[:2] - search.places[0][0].base[:2]) for place in search.places[0]]
+    nearest, step = compose(inverse(planar(*search.places[0][0].base)), X_OA)[0, 3], few[1]
+
+    def between(X_BA, q, posture=None):  # only half-way between two of the few the arms are free
+        return abs((nearest - X_BA[0, 3]) / step % 1.0 - 0.5) < 0.2
+
+    place, margin = stances(between, distance_min=0.6, distance_max=1.2, aside=0.0).find(X_OA, np.pi / 2)
+    assert margin >= CONFIG.margin_min and place.base.tolist() not in [p.base.tolist() for p in search.places[0]]
 
 
 def test_grasps_that_do_not_follow_a_turn_to_its_end_turn_as_far_as_they_reach():

@@ -732,8 +732,9 @@ def test_arms_wait_for_their_path_and_hold_still(base):
 def test_the_lift_is_chosen_where_the_arms_alone_do_not_reach(tmp_path):
     lifted = Robot.load(description.find("pr2/pr2.robot.yaml"))
     stances = Stances(lifted, VALVE, STANCE, VIEW, lambda *_: True)
-    places = stances.begin(X_OA, QUARTER, np.zeros(2)).places
-    assert len(places) == 3 and all(place.posture is None for place in places[0])
+    search = stances.begin(X_OA, QUARTER, np.zeros(2))
+    places = search.places
+    assert search.dense == 3 and all(place.posture is None for place in places[0])
     heights = sorted({float(place.posture[0]) for place in places[1]})
     low, high = lifted.posture.low[0], lifted.posture.high[0]
     assert heights[-1] == pytest.approx(high) and np.diff(heights).max() <= STANCE.lift_step + 1e-9

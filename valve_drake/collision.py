@@ -94,6 +94,12 @@ class CollisionModel:
         if described.ignore:
             self._ignore({(self._link(pair.id_A), self._link(pair.id_B)) for pair in self._near(None, robot.home)})
 
+    @property
+    def pairs(self) -> int:
+        """How many pairs of shapes is_free goes through."""
+        query = self._scene_graph.get_query_output_port().Eval(self._scene_graph.GetMyContextFromRoot(self._root))
+        return len(query.inspector().GetCollisionCandidates())
+
     def _link(self, shape: GeometryId) -> str:
         frame = self._scene_graph.model_inspector().GetFrameId(shape)
         name: str = self._plant.GetBodyFromFrameId(frame).name()

@@ -297,7 +297,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     collision = CollisionModel(robot)
     if touching := collision.touching(None, robot.home):
         raise ConfigError(f"{scenario.robot}: arms.left.home and arms.right.home must be free of all: {touching[0]}")
-    stances = Stances(robot, valve, scenario.stance, view, collision.is_free)
+    stances = Stances(robot, valve, scenario.stance, view, collision.is_free, collision.pairs)
     return [
         RobotStateSystem(robot.groups),
         ColorSegmentationSystem(scenario.color_segmentation, reach=1.3 * marker.reach()),

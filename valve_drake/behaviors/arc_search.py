@@ -1,11 +1,13 @@
-"""The best of all grasps for a turn from one place: a search in portions of one pair of grasps each."""
+"""The best of all grasps for a turn from one place: a search in portions."""
 
 import dataclasses as dc
+import math
 
 import numpy as np
 
 from valve_drake.behaviors.arcs import Arcs
 from valve_drake.behaviors.grasp_geometry import Arc, Pair, Turn, pairs
+from valve_drake.behaviors.questions import UNITS, Enough, Questions
 
 ONE_GRASP = 2.3  # a longer turn is not tried with one grasp alone [rad]
 FAR = 2.5  # a comfortable grasp that turns so far ends the search for a better one [rad]
@@ -13,7 +15,10 @@ FAR = 2.5  # a comfortable grasp that turns so far ends the search for a better 
 
 @dc.dataclass(frozen=True, eq=False)
 class ArcSearch:
-    """A search for the grasps at one place: see `GraspSearch.advance_arc`."""
+    """A search for the grasps at one place: see `GraspSearch.advance_arc`.
+
+    answers: of the pair that is being looked at, so far.
+    """
 
     turn: Turn
     groups: tuple[tuple[Pair, ...], ...]  # of `pairs`
@@ -22,6 +27,7 @@ class ArcSearch:
     index: int = 0  # of the next pair in its group
     best: Arc = Arc()
     begun: bool = False
+    answers: tuple[object, ...] = ()
     done: bool = False
 
 
@@ -37,13 +43,18 @@ class GraspSearch(Arcs):
         return tuple(pairs(self.valve, turn.X_BA, turn.angle if whole else np.copysign(ONE_GRASP / 2, turn.angle)))
 
     def advance_arc(self, search: ArcSearch) -> ArcSearch:
-        """The search after one more pair of grasps."""
+        """The search after one more pair of grasps, or with redundant arms after a part of the work on one."""
         c, s = self.config, search
+        redundant = any(len(arm) > 6 for arm in self.robot.arms.values())
+        ask = Questions(s.answers, UNITS if redundant else math.inf)
         bound = max(s.best.margin, s.turn.least) if s.whole else 0.0
-        arc = self.check_arc(dc.replace(s.turn, least=bound), s.groups[s.group][s.index], whole=s.whole)
+        try:
+            arc = self.check_arc(dc.replace(s.turn, least=bound), s.groups[s.group][s.index], whole=s.whole, ask=ask)
+        except Enough:
+            return dc.replace(s, answers=ask.answers())
         best = arc if _better(arc, s.best, s.whole) else s.best
         served = best.margin >= c.margin_good and (s.whole or abs(best.turn) > FAR)
-        after = dc.replace(s, index=s.index + 1, best=best, begun=s.begun or arc.begun)
+        after = dc.replace(s, index=s.index + 1, best=best, begun=s.begun or arc.begun, answers=())
         return dc.replace(after, done=True) if served else self._onwards(after)
 
     def _onwards(self, search: ArcSearch) -> ArcSearch:

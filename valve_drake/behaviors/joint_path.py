@@ -12,7 +12,8 @@ import numpy as np
 
 Free = Callable[[np.ndarray], bool]
 STEP = 0.03  # largest joint step between two checks [rad]
-PORTION = 12  # poses checked in one portion of a search; each takes 0.1 to 1 ms
+PORTION = 12  # poses checked in one portion of a search, at most; each takes 0.1 to 1 ms
+PAIRS = 11_000  # of shapes that they go through together, about
 LEAVE = 0.06  # poses this near to the start are not checked: the robot is there, free or not [rad]
 
 
@@ -86,7 +87,7 @@ GOAL, STRAIGHT, VIA, GROW, JOIN, SHORTEN = "goal", "straight", "via", "grow", "j
 
 @dc.dataclass(frozen=True)
 class PathSearch:
-    """A search for a path, cut into portions: `advance` makes the next one, with PORTION poses checked.
+    """A search for a path, cut into portions: `advance` makes the next one.
 
     First the goal alone, then the straight line, then the via poses, then RRT-Connect, then short-cuts.
     """
@@ -104,14 +105,17 @@ class PathSearch:
     done: bool = False
     points: np.ndarray | None = None  # (N, n), once found
 
-    def advance(self, is_free: Free) -> "PathSearch":
-        """The search after one more portion; the start need not be free: the robot is there."""
+    def advance(self, is_free: Free, pairs: int = 0) -> "PathSearch":
+        """The search after one more portion; the start need not be free: the robot is there.
+
+        pairs: of shapes that is_free goes through.
+        """
         s, start = self, self.start
 
         def free(q: np.ndarray) -> bool:
             return bool(np.max(np.abs(q - start)) < LEAVE) or is_free(q)
 
-        for _ in range(PORTION):
+        for _ in range(max(1, min(PORTION, PAIRS // max(pairs, 1)))):
             if s.done:
                 break
             if not s.lines:

@@ -3,9 +3,9 @@
     fine_approach  the stance for the whole turn, from the last few estimates, again every `period`
     a PlanRequest  grasps from where the robot stands, or a collision-free path of both arms
 
-A search takes up to some seconds of processor time. It is cut into portions of a few milliseconds (one place to stand
-at, one line of a path), one portion a step, so that no control tick waits for it. Portions are counted and not timed:
-the same inputs give the same answer in the same step.
+A search takes up to some seconds of processor time. It is cut into portions of 2 to 5 ms, one portion a step, so that
+no control tick waits for it. Portions are counted (inverse solutions, pairs of shapes) and not timed: the same inputs
+give the same answer in the same step.
 """
 
 import copy
@@ -172,7 +172,7 @@ class StancePlanner:
         if m.vias_left:
             vias = tuple(self.vias(request.start, request.goal, request.posture))
             return changed(m, path_search=dc.replace(search, vias=vias), vias_left=False)
-        search = search.advance(is_free)
+        search = search.advance(is_free, self.stances.shape_pairs)
         if not search.done:
             return changed(m, path_search=search)
         points = np.zeros(0) if search.points is None else search.points.ravel()

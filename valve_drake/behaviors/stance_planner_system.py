@@ -5,6 +5,7 @@ from valve_drake.messages import GraspPlan, ModeState, PathPlan, PlanRequest, Re
 from valve_drake.ports import TICK, Block, Inputs, Outputs
 
 PERIOD = 2 * TICK  # of its portions: every other tick is free of them
+PERIOD_REDUNDANT = TICK  # for arms of seven and more joints: more portions, smaller ones
 
 
 class StancePlannerInputs(Inputs):
@@ -14,7 +15,7 @@ class StancePlannerInputs(Inputs):
 
 
 class StancePlannerSystem(Block[StancePlannerInputs, Memory]):
-    """Searches stances, grasps and paths, a portion every 1/64 s, in slot 3.
+    """Searches stances, grasps and paths, a portion every 1/64 s (for redundant arms 1/128 s), in slot 3.
 
     port      dir  type               notes
     --------  ---  -----------------  ------------------------------------------------------
@@ -31,7 +32,8 @@ class StancePlannerSystem(Block[StancePlannerInputs, Memory]):
 
     def __init__(self, law: StancePlanner, name: str = "stance_planner"):
         self._law = law
-        super().__init__(name, period=PERIOD, slot=3)
+        redundant = any(len(arm) > 6 for arm in law.robot.arms.values())
+        super().__init__(name, period=PERIOD_REDUNDANT if redundant else PERIOD, slot=3)
 
     def initial(self) -> Memory:
         return Memory()

@@ -1,5 +1,4 @@
-"""The stance: where the robot stands so that both hands can turn the valve; a search in portions of one pair of grasps
-each."""
+"""The stance: where the robot stands so that both hands can turn the valve; a search in portions."""
 
 import dataclasses as dc
 
@@ -12,6 +11,7 @@ from valve_drake.frames import compose, inverse, planar
 from valve_drake.valve.valve import has_heading, heading, turned
 
 AROUND = (0.5, -0.5, 1.0, -1.0)  # sides from which a valve with an upright axis is tried, off the nearest [rad]
+FEW = 9  # distances of a search's first round
 AS_GOOD = 0.05  # a place whose margin has fallen by less is as good as it was
 
 
@@ -34,6 +34,7 @@ class StanceSearch:
     turn_angle: float
     places: tuple[tuple[Place, ...], ...]
     kept: bool = False  # the first group keeps a lift where it is: it will do where it is accepted
+    dense: int = 100  # groups from this one on are tried only if nothing before is accepted
     group: int = 0
     index: int = 0  # of the next place in its group
     split: bool = False  # in the second round: by several grasps, where no place serves with one
@@ -68,9 +69,11 @@ class Stances(GraspSearch):
         """
         found = last is not None and last.best is not None and last.margin >= self.config.margin_min
         if last is None or last.best is None or not found:
-            return StanceSearch(X_OA, turn_angle, self._places(X_OA, viewer, None))
+            places, dense = self._places(X_OA, viewer, None)
+            return StanceSearch(X_OA, turn_angle, places, dense=dense)
         posture = self.robot.posture.home if last.best.posture is None else last.best.posture
-        afresh = StanceSearch(X_OA, turn_angle, self._places(X_OA, viewer, posture), kept=self.robot.lift > 0)
+        places, dense = self._places(X_OA, viewer, posture)
+        afresh = StanceSearch(X_OA, turn_angle, places, kept=self.robot.lift > 0, dense=dense)
         if self.robot.lift or (last.found_in == 0 and last.margin >= self.config.margin_good):
             return afresh
         there = Place(_moved(last.best.base, last.X_OA, X_OA), last.best.posture)
@@ -86,28 +89,36 @@ class Stances(GraspSearch):
 
     def _places(
         self, X_OA: np.ndarray, viewer: np.ndarray, posture: np.ndarray | None
-    ) -> tuple[tuple[Place, ...], ...]:
+    ) -> tuple[tuple[tuple[Place, ...], ...], int]:
         """Square to the panel, from near to far; first with the lift as given, then at home, then at other heights,
-        then a step aside."""
+        then a step aside. Where the robot may stand at many distances, a few of them, and then all -> groups, and from
+        which on it is all of them."""
         c: StanceConfig = self.config
         angle = heading(X_OA, viewer)
         left = np.array([-np.sin(angle), np.cos(angle)])
         stem = compose(X_OA, self.valve.X_AP())[:2, 3]  # at the panel
         distances = c.distances(self.robot.stand)
-        bases = [_before(stem, distance, angle) for distance in distances]
+        every = [_before(stem, distance, angle) for distance in distances]
+        thin = -(-len(every) // FEW)
+        distances, bases = distances[::thin], every[::thin]
         home = self.robot.posture.home
         groups = [tuple(Place(base) for base in bases)]
         if posture is not None and self.robot.lift:
             kept = tuple(Place(base, posture) for base in bases)
             groups = [kept, *(groups if np.max(np.abs(posture - home)) > 1e-3 else [])]
-        if raised := self._postures():
+        raised = self._postures()
+        if raised:
             groups.append(tuple(Place(base, posture) for posture in raised for base in bases))
         if not has_heading(X_OA):  # a valve that lies flat is turned from any side
             groups += [tuple(Place(_before(stem, d, angle + off)) for d in distances) for off in AROUND]
         elif c.aside > 0:
             steps = [np.array([*(side * c.aside * left), 0.0]) for side in (1.0, -1.0)]
-            groups.append(tuple(Place(base + step) for step in steps for base in bases[::2]))
-        return tuple(groups)
+            groups.append(tuple(Place(base + step) for step in steps for base in every[:: 2 * thin]))
+        dense = len(groups)
+        if thin > 1:
+            groups.append(tuple(Place(base) for base in every))
+            groups.append(tuple(Place(base, posture) for posture in raised for base in every))
+        return tuple(group for group in groups if group), dense
 
     def _postures(self) -> list[np.ndarray]:
         """Other heights of the lift; none without one."""
@@ -138,7 +149,7 @@ class Stances(GraspSearch):
         group, index = s.group, s.index + 1
         if index == len(s.places[group]):
             group, index = group + 1, 0
-        good = c.margin_min if s.kept and group == 1 else c.margin_good
+        good = c.margin_min if (s.kept and group == 1) or group >= s.dense else c.margin_good
         more = group < len(s.places) and (index > 0 or s.margin < good)
         done = s.margin >= c.margin_enough or not more
         if done and s.instead is not None and s.margin < s.wanted:
