@@ -7,13 +7,12 @@ import pathlib
 import numpy as np
 import pytest
 from drawn_scene import edge_points, facing
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from valve_drake import frames
 from valve_drake import scenario as scenarios
 from valve_drake.camera.lens import load_head
-from valve_drake.checks import ConfigError
 from valve_drake.messages import RectangleEstimate
 from valve_drake.perception.ambiguity import Track
 from valve_drake.perception.fusion import fuse
@@ -126,26 +125,3 @@ def test_its_frame_and_picture_do_not_turn_with_the_wheel():
         poses.append(plant.CalcRelativeTransform(context, axis, marker).GetAsMatrix34())
     expected = frames.compose(frames.inverse(shape.X_AP()), shape.X_AV())
     assert poses[0] == pytest.approx(expected) and poses[1] == pytest.approx(expected)
-
-
-WRONG = {
-    "xyz: [0, -0.2, 0.085]": "valve.marker.xyz must be at least 0.237 m off the axis on a panel",
-    "xyz: [0, -0.4, 0.085]": "valve.marker.xyz must be at most 0.35 m off the axis on a panel",
-    "xyz: [0, -0.24, 0.2]": "valve.marker.xyz must be before the panel",
-}
-
-
-@pytest.mark.parametrize("marker", WRONG)
-def test_a_marker_that_handles_pass_before_or_that_is_too_far_off_is_refused(marker):
-    with pytest.raises(ConfigError) as error:
-        valve(marker=marker)
-    assert WRONG[marker] in str(error.value) and "\n" not in str(error.value)
-
-
-def test_a_model_with_its_marker_on_the_wheel_is_refused():
-    scenario = scenarios.parse("valve: {marker: {carrier: panel, xyz: [0, -0.26, 0.085]}}", "a file")
-    scenario.check()
-    with pytest.raises(
-        ConfigError, match=r"valve\.marker\.carrier must be where valve\.model has its frame marker, wheel"
-    ):
-        add_valve(MultibodyPlant(0.0), scenario.valve)

@@ -137,7 +137,8 @@ class Valve(Config):
         before = self.marker.xyz[2] < self.panel.depth
         require(before, f"{key}.marker.xyz", f"before the panel, z below {self.panel.depth:g}", self.marker.xyz)
         if self.fixed:
-            off, inner = math.hypot(*self.marker.xyz[:2]), self._outermost() + math.hypot(*self.marker.size) / 2
+            off = math.hypot(*self.marker.xyz[:2])
+            inner = math.ceil(1e3 * (self._outermost() + math.hypot(*self.marker.size) / 2)) / 1e3
             words = f"at least {inner:.3g} m off the axis on a panel: nearer to it the handles pass before it"
             require(off >= inner, f"{key}.marker.xyz", words, self.marker.xyz)
             words = f"at most {FARTHEST:g} m off the axis on a panel: the head sees marks and marker in one image"
