@@ -107,7 +107,10 @@ def test_the_axis_turns_by_the_marks_angle_and_looks_are_fused_so():
 
 
 def test_the_head_looks_between_marker_and_axis():
-    assert valve().look() == pytest.approx([0.0, 0.12, -0.0425])
+    look = valve().look()
+    assert np.linalg.norm(look) == pytest.approx(0.11) and look / 0.11 == pytest.approx(
+        np.array([0.0, 0.24, -0.085]) / math.hypot(0.24, 0.085)
+    )
     assert Valve().look() is None
     assert valve().target().reach() == pytest.approx((0.24 + 0.15) / 0.08)
 

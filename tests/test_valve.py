@@ -47,7 +47,10 @@ WRONG = {
     "valve: {marker: {xyz: [0, 0, 0.2]}}": "valve.marker.xyz must be before the panel",
     "valve: {marker: {rpy: [1.2, 0, 0]}}": "valve.marker.rpy must be facing the robot",
     PANEL % "[0, -0.2, 0.085]": "valve.marker.xyz must be at least 0.251 m off the axis on a panel",
-    PANEL % "[0, -0.4, 0.085]": "valve.marker.xyz must be at most 0.35 m off the axis on a panel",
+    PANEL % "[0, -0.4, 0.085]": "valve.marker.xyz must be at most 0.27 m off the axis on a panel",
+    "valve: {marker: {carrier: panel}, handles: [{xyz: [0.2, 0, 0]}, {xyz: [-0.2, 0, 0]}]}": (
+        "valve.marker.carrier must be wheel: a panel's marker beside these handles, 0.301 m off the axis, is not seen"
+    ),
     "valve: {marker: {carrier: door}}": "valve.marker.carrier must be wheel or panel",
     "valve: {opens: left}": "valve.opens must be counter_clockwise or clockwise",
     HANDLES % "{xyz: [0.15, 0, 0]}": "valve.handles must be 2 to 12 places",

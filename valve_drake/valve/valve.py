@@ -20,7 +20,9 @@ from valve_drake.messages import RectangleEstimate
 from valve_drake.perception.marker import Marker
 
 OPENING = {"counter_clockwise": 1.0, "clockwise": -1.0}  # sense that opens -> its sign about -z of A
-FARTHEST = 0.35  # of a marker on the panel from the axis [m]
+# At a stance the head's cameras see 0.37 by 0.5 m: a marker on the panel whole, and marks as far from it as FARTHEST.
+FARTHEST = 0.27  # of such a marker from the axis [m]
+LOOK = 0.11  # from such a marker's middle towards the axis, where the head looks [m]
 ALIKE = 0.02  # handles that differ by less look the same to the head's cameras [m]
 _UPRIGHT = 0.35  # horizontal part of an axis' direction below which it has no heading of its own
 
@@ -139,6 +141,8 @@ class Valve(Config):
         if self.fixed:
             off = math.hypot(*self.marker.xyz[:2])
             inner = math.ceil(1e3 * (self._outermost() + math.hypot(*self.marker.size) / 2)) / 1e3
+            words = f"wheel: a panel's marker beside these handles, {inner:g} m off the axis, is not seen with them"
+            require(inner <= FARTHEST, f"{key}.marker.carrier", words, self.marker.carrier)
             words = f"at least {inner:.3g} m off the axis on a panel: nearer to it the handles pass before it"
             require(off >= inner, f"{key}.marker.xyz", words, self.marker.xyz)
             words = f"at most {FARTHEST:g} m off the axis on a panel: the head sees marks and marker in one image"
@@ -155,7 +159,10 @@ class Valve(Config):
 
     def look(self) -> np.ndarray | None:
         """Where the head looks, off the marker's middle, to see it and the marks, in V (3,) [m]; None: at it."""
-        return self.X_VA()[:, 3] / 2 if self.fixed else None
+        if not self.fixed:
+            return None
+        axis = self.X_VA()[:, 3]
+        return axis * min(0.5, LOOK / float(np.linalg.norm(axis)))
 
     def seen_by(self, estimate: RectangleEstimate) -> bool:
         """Whether an estimate tells how the valve is turned: of a marker on the panel, if a green mark was seen."""
