@@ -77,3 +77,26 @@ def crooked_wrist(model: Model) -> None:
         put(part(model, "link", f"{side}_wrist_1"), "pose", "0.29 0 0.03 0 0 0")
         put(part(model, "link", f"{side}_wrist_2"), "pose", "0.03 0 -0.03 0 0 0")
         put(part(model, "link", f"{side}_wrist_3"), "pose", "0.02 0.02 0.01 0 0 0")
+
+
+def holonomic(given: dict[str, Any]) -> None:
+    """A base that goes sideways, too."""
+    given["base"] |= {"drive": "holonomic", "speed": [0.8, 0.5, 1.2], "acceleration": [0.8, 0.6, 2.0]}
+
+
+def without_base_joints(model: Model) -> None:
+    for kind, name in (("joint", "base_x"), ("joint", "base_y"), ("joint", "base_yaw"),
+                       ("link", "base_x_carriage"), ("link", "base_y_carriage")):  # fmt: skip
+        model.remove(part(model, kind, name))
+
+
+def fixed(given: dict[str, Any]) -> None:
+    """Bolted to the floor; the model is that `without_base_joints`."""
+    given["base"] |= {"drive": "fixed", "speed": [], "acceleration": []}
+
+
+def without_force_sensors(given: dict[str, Any]) -> None:
+    """Forces by the joints' torques, which a gear's sensor reads to a tenth of a newton meter."""
+    for side in SIDES:
+        count = len(given["arms"][side]["joints"])
+        given["arms"][side] |= {"sensor": "torque", "torque_noise": [0.1] * count, "torque_bias": [0.2] * count}

@@ -8,7 +8,7 @@ from helpers import Rig, assert_clones_are_independent, assert_holds_between_upd
 from robot_facts import ROBOT
 
 from valve_drake.behaviors import valve_search
-from valve_drake.behaviors.base_approach import BaseApproachConfig, MedianPlace, Memory, step
+from valve_drake.behaviors.base_approach import BaseApproachConfig, MedianPlace, Memory, step, within
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, inverse, make, rot_z, wrap
@@ -24,6 +24,8 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.ports import TICK
+from valve_drake.robot.drive import DIFFERENTIAL
+from valve_drake.robot.drive import drive as base_drive
 from valve_drake.valve.valve import Valve
 
 DT = 1 / 64  # half the real rate: the laws do not depend on it, and the tests are quicker
@@ -48,6 +50,35 @@ class Wheels:
         v, w = self.twist
         middle = self.pose[2] + w * DT / 2
         self.pose = self.pose + DT * np.array([v * np.cos(middle), v * np.sin(middle), w])
+
+
+OMNI = base_drive("holonomic", [0.8, 0.5, 1.2], [0.8, 0.6, 2.0])
+FIXED = base_drive("fixed", [], [])
+
+
+@dc.dataclass
+class Omniwheels(Wheels):
+    """The same of a base that goes sideways, too."""
+
+    twist: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))
+    queue: list = dc.field(default_factory=lambda: [np.zeros(3)] * 2)
+
+    def drive(self, command: np.ndarray) -> None:
+        self.queue.append(command)
+        wanted = self.queue.pop(0)
+        self.twist = self.twist + np.clip((wanted - self.twist) / 0.08, [-1, -1, -2.5], [1, 1, 2.5]) * DT
+        v, u, w = self.twist
+        c, s = np.cos(self.pose[2] + w * DT / 2), np.sin(self.pose[2] + w * DT / 2)
+        self.pose = self.pose + DT * np.array([v * c - u * s, v * s + u * c, w])
+
+
+@dc.dataclass
+class Bolted:
+    pose: np.ndarray
+    twist: np.ndarray = dc.field(default_factory=lambda: np.zeros(0))
+
+    def drive(self, command: None) -> None:
+        assert command is None  # nobody asks it to move
 
 
 def valve(depth: float) -> Valve:
@@ -97,7 +128,19 @@ class Run:
     details: set
 
 
-def drive(mode, wheels, scene, *, limit=40.0, config=CONFIG, alter=None, visible=None, watch=None, scale=1.0):
+def drive(
+    mode,
+    wheels,
+    scene,
+    *,
+    limit=40.0,
+    config=CONFIG,
+    alter=None,
+    visible=None,
+    watch=None,
+    scale=1.0,
+    base=DIFFERENTIAL,
+):
     """Runs one activation until it ends -> Run.
 
     alter(t, messages) changes what is seen, visible() says whether anything is,
@@ -111,13 +154,14 @@ def drive(mode, wheels, scene, *, limit=40.0, config=CONFIG, alter=None, visible
         if k % 8 == 4 and (visible is None or visible()):
             seen = scene.look(t, wheels.pose)
             seen = alter(t, seen) if alter else seen
-        odometry = np.concatenate([wheels.pose, wheels.twist]) * [scale, scale, 1, scale, 1]
+        units = [scale, scale, 1, *[scale] * (len(wheels.twist) - 1), 1][: 3 + len(wheels.twist)]
+        odometry = np.concatenate([wheels.pose, wheels.twist]) * units
         if scene.noise:
             odometry[:3] += scene.rng.normal(size=3) * np.array([3e-4, 3e-4, 3e-4])
         robot = RobotState(time=t, odometry=odometry)
         if watch:
             watch(robot, state, seen)
-        memory, command, status = step(config, valve(scene.depth), memory, t, DT, robot, state, *seen)
+        memory, command, status = step(config, valve(scene.depth), memory, t, DT, robot, state, *seen, base)
         wheels.drive(command.base_twist)
         poses.append(wheels.pose)
         twists.append(command.base_twist)
@@ -491,6 +535,107 @@ def test_block_refuses_a_wrong_message_and_needs_the_robot_state():
         rig(stance=StereoPosition(), mode=ModeState(mode="fine_approach", activation=1)).run(0.1)
     with pytest.raises(RuntimeError, match="robot_state.*base_approach.*nothing is connected"):
         Rig(BaseApproachSystem(CONFIG, VALVE), mode=ModeState(mode="retreat", activation=1)).run(0.1)
+
+
+# ---------------------------------------------------------------- other bases
+
+
+def test_a_holonomic_base_arrives_from_50_random_starts_sooner_and_off_the_panel():
+    rng = np.random.default_rng(5)
+    times = []
+    for _ in range(50):
+        scene = random_scene(rng)
+        start = place(scene, rng.uniform(-1, 1) * np.deg2rad(70), rng.uniform(1.2, 2.2), rng.uniform(-0.3, 0.3))
+        run = drive(Mode.FINE_APPROACH, Omniwheels(start), scene, base=OMNI)
+        assert_arrived(run, scene)
+        assert_clear(run, scene, start)
+        assert np.all(np.abs(run.twists) <= OMNI.speed + 1e-9)
+        assert run.details <= {"waiting for a stance", "plan", "go", "settle", *(d for d in run.details if " mm" in d)}
+        times.append(run.time)
+    assert max(times) < 15 and np.median(times) < 9
+
+
+def test_a_holonomic_base_beside_the_stance_steps_aside_and_does_not_back_off():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    start = scene.stance() + [0.0, 0.2, 0.0]
+    run = drive(Mode.FINE_APPROACH, Omniwheels(start), scene, base=OMNI)
+    assert_arrived(run, scene)
+    assert run.poses[:, 0].min() > start[0] - 0.01 and np.max(np.abs(run.poses[:, 2])) < 0.01
+    assert np.max(np.abs(run.twists[:, 0])) < 0.03 < np.max(np.abs(run.twists[:, 1]))
+
+
+def test_a_holonomic_base_that_is_too_near_moves_away_from_the_panel_first():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    start = np.array([DEPTH - 0.4, 0.5, 0.2])
+    run = drive(Mode.FINE_APPROACH, Omniwheels(start), scene, base=OMNI)
+    assert_arrived(run, scene)
+    inside = run.poses[:, 0] > DEPTH - CONFIG.clearance
+    first_out = int(np.argmin(inside))
+    assert 0 < first_out and not inside[first_out:].any()
+    assert np.all(np.diff(run.poses[:first_out, 0]) < 1e-6)
+
+
+def test_a_holonomic_base_drives_to_the_marker_while_it_still_turns_to_it():
+    times = []
+    for base, wheels in ((DIFFERENTIAL, Wheels), (OMNI, Omniwheels)):
+        scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
+        run = drive(Mode.ROUGH_APPROACH, wheels(place(scene, 0.0, 4.0, 1.2)), scene, base=base)
+        assert run.status.state == "succeeded"
+        last = run.poses[-1]
+        assert np.hypot(*last[:2]) < CONFIG.rough_distance and np.hypot(*last[:2]) > CONFIG.rough_stop - 0.05
+        times.append(run.time)
+    assert times[1] < times[0] - 0.3
+    assert np.ptp(run.poses[:, 1]) < 0.12  # straight there
+
+
+def test_a_holonomic_base_goes_straight_back():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    start = np.array([-0.6, 0.1, 0.3])
+    run = drive(Mode.RETREAT, Omniwheels(start, twist=np.array([0.0, 0.05, 0.0])), scene, base=OMNI)
+    way = run.poses[-1] - start
+    along = np.array([np.cos(0.3), np.sin(0.3)])
+    assert run.status.state == "succeeded" and -way[:2] @ along == pytest.approx(0.5, abs=0.02)
+    assert abs(way[0] * along[1] - way[1] * along[0]) < 0.01
+
+
+def test_a_base_that_is_slower_than_the_config_is_asked_for_no_more_than_it_can():
+    slow = base_drive("holonomic", [0.2, 0.1, 0.3], [0.3, 0.2, 0.4])
+    config = within(CONFIG, slow, 0.7)
+    assert config.clearance == 0.7 and config.yaw_rate == 0.3 and config.acceleration == 0.2
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    scene.stance = lambda: np.array([DEPTH - 0.8, 0.0, 0.0])
+    run = drive(Mode.FINE_APPROACH, Omniwheels(place(scene, 0.8, 2.0)), scene, config=CONFIG, base=slow, limit=60.0)
+    assert np.all(np.abs(run.twists[:, :2]) <= slow.speed[:2] + 1e-9)
+    assert np.max(np.abs(run.twists[:, 1])) == pytest.approx(0.1, abs=0.01)  # the direction is kept
+    assert within(CONFIG, DIFFERENTIAL, 0.0) == CONFIG  # ours can do all that the config asks
+
+
+def at_origin(seen, reason=""):
+    """A fixed robot's stance is where it stands, if there is one."""
+    found = dc.replace(seen[2], base=np.zeros(3), found=not reason, reason=reason)
+    return (*seen[:2], found)
+
+
+def test_a_fixed_base_looks_whether_it_stands_well_and_never_moves():
+    scene = Scene(np.array([0.6, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    for mode, detail in (
+        (Mode.ROUGH_APPROACH, "marker 0.60 m away"),
+        (Mode.FINE_APPROACH, "+0 mm along"),
+        (Mode.RETREAT, "the base is fixed"),
+    ):
+        run = drive(mode, Bolted(np.zeros(3)), scene, base=FIXED, alter=lambda t, seen: at_origin(seen))
+        assert run.status.state == "succeeded" and detail in run.status.detail and run.time < 2
+
+
+def test_a_valve_out_of_a_fixed_robots_reach_ends_the_run_honestly():
+    far = Scene(np.array([3.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    run = drive(Mode.ROUGH_APPROACH, Bolted(np.zeros(3)), far, base=FIXED)
+    assert run.status.verdict == Verdict.REACH_LIMIT and "3.00 m away, and the base is fixed" in run.status.detail
+    near = Scene(np.array([1.2, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
+    run = drive(
+        Mode.FINE_APPROACH, Bolted(np.zeros(3)), near, base=FIXED, alter=lambda t, seen: at_origin(seen, "too far")
+    )
+    assert run.status.verdict == Verdict.REACH_LIMIT and run.status.detail == "too far"
 
 
 # ---------------------------------------------------------------- odometry

@@ -276,8 +276,8 @@ def test_any_command_whatever_gives_outputs_within_all_limits():
             velocity = np.zeros(17)
         last = position
         new = bench.out("base.twist_command")
-        assert np.all(np.abs(new) <= CONFIG.base_speed)
-        assert np.all(np.abs(new - twist) <= np.array(CONFIG.base_acceleration) * DT * (1 + 1e-9))
+        assert np.all(np.abs(new) <= ROBOT.drive.speed)
+        assert np.all(np.abs(new - twist) <= ROBOT.drive.acceleration * DT * (1 + 1e-9))
         twist = new
         assert all(0 <= bench.out(f"{g}.force_limit")[0] <= CONFIG.gripper_force for g in GRIPPERS)
 
@@ -581,7 +581,6 @@ def test_block_refuses_a_wrong_message_and_a_wrong_config():
     "changes, words",
     [
         ({"acceleration_arm": float("nan")}, "command_selector.acceleration_arm"),
-        ({"base_acceleration": [0.0, 1.0]}, "command_selector.base_acceleration"),
         ({"trip_force": -1.0}, "command_selector.trip_force"),
     ],
 )

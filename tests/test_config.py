@@ -171,14 +171,13 @@ def test_ages_are_bounded_for_every_device_and_known_devices_only():
         assert rule.bounds(device)[1] == (1.0 if camera else 0.25)
 
 
-def test_base_and_grippers_are_bounded_by_the_robots_own_limits():
+def test_grippers_are_bounded_by_the_robots_own_limits():
     joints = {}
     for joint in ElementTree.parse(resources.models() / "robot" / "robot.sdf").iter("joint"):
         limit = joint.find("axis/limit")
         if limit is not None:
             joints[joint.get("name")] = {child.tag: float(child.text) for child in limit}
     high = {key: leaf.rule.high for key, leaf in LEAVES.items() if key.startswith("command_selector.")}
-    assert list(high["command_selector.base_speed"]) == [joints[n]["velocity"] for n in ("base_x", "base_yaw")]
     assert high["command_selector.gripper_force"] == joints["left_finger_1"]["effort"]
     assert high["command_selector.gripper_speed"] == joints["left_finger_1"]["velocity"]
     assert high["command_selector.gripper_high"] == 2 * joints["left_finger_1"]["upper"]

@@ -43,6 +43,16 @@ def stance(X_OA: np.ndarray, turn: float, **changes):
     return place.base, margin
 
 
+def test_a_robot_that_is_bolted_down_asks_only_of_where_it_stands():
+    X_OA = valve_at(1.0)
+    base, margin = stance(X_OA, 90)
+    here = compose(inverse(planar(*base)), X_OA)  # the valve as it is for a robot that stands there
+    where, found = dc.replace(stances(), bolted=True).find(here, np.deg2rad(90))
+    assert where.base.tolist() == [0, 0, 0] and found == pytest.approx(margin, abs=0.05)
+    away = compose(planar(0.4, 0.0, 0.0), here)
+    assert dc.replace(stances(), bolted=True).find(away, np.deg2rad(90))[1] < 0
+
+
 # ---------------------------------------------------------------- the turn's sign
 
 

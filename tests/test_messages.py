@@ -36,7 +36,8 @@ def test_arrays_are_float64_of_the_declared_shape(kind):
         if field.metadata["optional"]:
             assert value is None
         else:
-            assert value.shape == tuple(0 if n < 0 else n for n in shape)
+            size = 5 if field.name == "odometry" else 0  # of any length: that of a base with two speeds
+            assert value.shape == tuple(size if n < 0 else n for n in shape)
             assert value.dtype == np.float64
         given = np.ones([2 if n < 0 else n for n in shape], int)
         assert np.array_equal(getattr(kind(**{field.name: given.tolist()}), field.name), given)

@@ -10,7 +10,7 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from robot_facts import MIRROR, ROBOT, robot_state
-from robot_variants import part, put, seven_joints, variant, with_roll
+from robot_variants import fixed, part, put, seven_joints, variant, with_roll, without_base_joints
 
 from valve_drake import cli, named_files, resources, yaml_file
 from valve_drake.checks import ConfigError
@@ -113,12 +113,7 @@ def test_a_description_can_be_kept_and_read_anywhere(tmp_path):
 
 
 def test_planar_joints_are_added_to_a_model_that_has_none(tmp_path):
-    def edit(m):
-        for kind, name in (("joint", "base_x"), ("joint", "base_y"), ("joint", "base_yaw"),
-                           ("link", "base_x_carriage"), ("link", "base_y_carriage")):  # fmt: skip
-            m.remove(part(m, kind, name))
-
-    robot = Robot.load(variant(tmp_path, edit))
+    robot = Robot.load(variant(tmp_path, without_base_joints))
     assert robot.base.names == ("base_x", "base_y", "base_yaw")
     assert robot.forward(LEFT, np.zeros(6)) == pytest.approx(ROBOT.forward(LEFT, np.zeros(6)))
     plant = robot.model.plant
@@ -275,15 +270,7 @@ def test_a_head_that_turns_the_other_way_looks_where_it_is_asked_to(tmp_path):
 
 
 def test_a_fixed_base_hangs_on_the_world(tmp_path):
-    def edit(m):
-        for kind, name in (("joint", "base_x"), ("joint", "base_y"), ("joint", "base_yaw"),
-                           ("link", "base_x_carriage"), ("link", "base_y_carriage")):  # fmt: skip
-            m.remove(part(m, kind, name))
-
-    def fix(given):
-        given["base"] = {"frame": "B", "drive": "fixed", "speed": [], "acceleration": []}
-
-    robot = Robot.load(variant(tmp_path, edit, fix))
+    robot = Robot.load(variant(tmp_path, without_base_joints, fixed))
     assert len(robot.base) == 0
     assert robot.forward(LEFT, np.zeros(6)) == pytest.approx(ROBOT.forward(LEFT, np.zeros(6)))
 
@@ -331,6 +318,11 @@ def swapped(given):
         given["arms"]["right"]["joints"],
         given["arms"]["left"]["joints"],
     )
+
+
+def by_torque(**keys):
+    """A left arm without a force sensor, its other keys as given."""
+    return lambda given: given["arms"]["left"].update(sensor="torque", **keys)
 
 
 WRONG = {
@@ -391,7 +383,38 @@ WRONG = {
         at("arms.left.sensor", "right_wrist_sensor"),
         "arms.left.sensor must be a fixed joint between left_arm_6 and left_grip, got 'right_wrist_sensor'",
     ),
-    "no sensor": (at("arms.left.sensor", "torque"), "arms.left.sensor: torque is not supported yet"),
+    "torques without their noise": (
+        at("arms.left.sensor", "torque"),
+        "arms.left.torque_noise must be one value for each of 6 joints, got []",
+    ),
+    "torques without noise": (
+        by_torque(torque_noise=[0.0] * 6),
+        "arms.left.torque_noise[0] must be within [0.0001, 100], got 0",
+    ),
+    "biases of another arm": (
+        by_torque(torque_noise=[0.1] * 6, torque_bias=[0.1]),
+        "arms.left.torque_bias must be one value for each of 6 joints, got [0.1]",
+    ),
+    "noise of a joint that nobody reads": (
+        at("arms.left.torque_noise", [0.1] * 6),
+        "arms.left.torque_noise must be left out without sensor: torque",
+    ),
+    "five joints feel no wrench": (
+        by_torque(
+            joints=[f"left_arm_{k}" for k in (1, 2, 3, 4, 5)], home=[0.0] * 5, work=[0.0] * 5, torque_noise=[0.1] * 5
+        ),
+        "arms.left.sensor must be a fixed joint: torque needs 6 joints or more, got 'torque'",
+    ),
+    "a holonomic base with two speeds": (
+        at("base.drive", "holonomic"),
+        "base.speed must be 3 values for a holonomic base, got [0.8, 1.2]",
+    ),
+    "a holonomic base with two accelerations": (
+        lambda given: given["base"].update(drive="holonomic", speed=[0.8, 0.5, 1.2]),
+        "base.acceleration must be 3 values for a holonomic base, got [0.8, 2",
+    ),
+    "a base faster than its model": (at("base.speed", [0.8, 2.5]), "base.speed[1] must be at most 2, base_yaw's limit"),
+    "a base slower than slow": (at("base.speed", [0.001, 1.2]), "base.speed[0] must be within [0.01, 3], got 0.001"),
     "lengths in millimeters": (at("base.footprint", [275, 275]), "base.footprint[0] must be within [0.05, 2], got 275"),
     "a drive that there is none of": (at("base.drive", "tracks"), "base.drive must be differential or holonomic"),
     "a fixed base that moves": (at("base.drive", "fixed"), "base.drive must be one that moves: base_x, base_y"),

@@ -8,12 +8,13 @@ import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
 from robot_facts import ROBOT, robot_state
 
-from valve_drake.behaviors.valve_search import Memory, ValveSearchConfig, aim, step
+from valve_drake.behaviors.valve_search import Memory, ValveSearchConfig, aim, bolted, step
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, inverse, make
 from valve_drake.messages import Mode, ModeState, RectangleEstimate, RobotState, StereoPosition, Verdict
 from valve_drake.ports import TICK
+from valve_drake.robot.drive import DIFFERENTIAL, drive
 
 DT = 1 / 64  # half the real rate: the laws do not depend on it, and the tests are quicker
 CONFIG = ValveSearchConfig()
@@ -74,13 +75,13 @@ class World:
             self.base = self.base + [0, 0, self.rate * DT]
 
 
-def search(world: World, limit: float = 60.0, config: ValveSearchConfig = CONFIG):
+def search(world: World, limit: float = 60.0, config: ValveSearchConfig = CONFIG, base=DIFFERENTIAL):
     """Runs one search -> status, time, commanded torsos (n, 3)."""
     memory, mode, torsos = Memory(), ModeState(mode="search", activation=4), []
     for k in range(int(limit / DT)):
         robot = world.tick(k)
         memory, command, status = step(
-            config, memory, k * DT, DT, robot, mode, world.position, RectangleEstimate(), HEAD
+            config, memory, k * DT, DT, robot, mode, world.position, RectangleEstimate(), HEAD, drive=base
         )
         world.obey(command)
         torsos.append(command.torso)
@@ -88,6 +89,27 @@ def search(world: World, limit: float = 60.0, config: ValveSearchConfig = CONFIG
             break
     assert status.activation == 4
     return status, k * DT, np.array(torsos), memory
+
+
+FIXED = drive("fixed", [], [])
+
+
+@pytest.mark.parametrize("height", [0.6, 0.81, 1.0, 1.22, 1.4])
+@pytest.mark.parametrize("bearing", [-0.6, 0.0, 0.6])
+def test_a_fixed_robot_finds_a_valve_within_its_reach_with_the_head_alone(bearing, height):
+    p_OV = around(bearing, 0.75, height)
+    world = World(p_OV, np.random.default_rng(3))
+    status, time, _, memory = search(world, config=bolted(CONFIG), base=FIXED)
+    assert status.state == "succeeded", status.detail
+    assert np.linalg.norm(memory.target - p_OV) < 0.04 and time < 35
+    assert world.base.tolist() == [0, 0, 0]
+
+
+def test_a_fixed_robot_that_sees_nothing_says_so_within_the_modes_deadline():
+    status, time, torsos, _ = search(World(around(np.pi, 2.0, 1.0), np.random.default_rng(3)), config=bolted(CONFIG),
+                                     base=FIXED)  # fmt: skip
+    assert status.verdict == "not_found" and "as far as the head turns" in status.detail and time < 50
+    assert np.max(torsos[:, 1]) > CONFIG.pitch_high - 0.25  # it has looked down, too
 
 
 def around(bearing: float, distance: float, height: float) -> np.ndarray:

@@ -6,7 +6,7 @@ scenario are in diagrams/ (made by `valve-drake draw`; a test keeps them current
 
 import dataclasses as dc
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPor
 from pydrake.systems.primitives import Multiplexer
 
 from valve_drake import named_files
-from valve_drake.behaviors.base_approach import BaseApproachConfig
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.behaviors.blind_servo import STRAIGHT, BlindServo
 from valve_drake.behaviors.grasp_geometry import Turn
@@ -56,7 +55,7 @@ from valve_drake.stations.contract import CONTRACT, vectors
 from valve_drake.stations.hardware import RobotLink, make_hardware_station
 from valve_drake.stations.plant_system import PlantSystem
 from valve_drake.stations.replay import Recording, make_replay_station
-from valve_drake.stations.scene import panel_pose
+from valve_drake.stations.scene import panel_pose, start_pose
 from valve_drake.stations.simulated import RobotStart, make_plant, make_simulated_station, rig_arguments
 from valve_drake.stations.simulation_config import StartConfig
 from valve_drake.supervisor.command_selector_system import CommandSelectorSystem
@@ -168,7 +167,6 @@ def robot_of(scenario: Scenario) -> Robot:
             require(bool(d.cameras[f"{side}_wrist"]), f"cameras.{side}_wrist", words, d.cameras[f"{side}_wrist"])
         for key in ("pan", "tilt"):
             require(bool(getattr(d.gaze, key)), f"gaze.{key}", "given: the search turns the eyes by it", "")
-        require(d.base.drive != "fixed", "base.drive", "one that moves (fixed is not supported yet)", d.base.drive)
         _gaze(scenario.valve_search, robot)
         high, width = scenario.command_selector.gripper_high, max(h.width for h in scenario.valve.handles)
         require(d.opening <= high, "opening", f"at most command_selector.gripper_high, {high:g}", d.opening)
@@ -243,9 +241,8 @@ def make_station(
     """The station of a resolved scenario. recording: for station `replay`; link: for station `hardware`; workers and
     physics: of `rig_of` and `plant_of`, for station `simulated`."""
     if scenario.station == "hardware":
-        return make_hardware_station(
-            RobotLink(Bus(scenario.hardware), robot_of(scenario).groups) if link is None else link
-        )
+        robot = robot_of(scenario)
+        return make_hardware_station(RobotLink(Bus(scenario.hardware), robot.groups) if link is None else link, robot)
     if scenario.station == "replay":
         if recording is None:
             raise ConfigError("station replay needs a log: valve-drake replay LOG")
@@ -270,9 +267,12 @@ def plant_of(scenario: Scenario) -> PlantSystem:
 
 def rig_of(scenario: Scenario) -> tuple[Any, ...]:
     """The simulated cameras of a resolved scenario, as the arguments of CameraRig or CameraWorkers."""
-    return rig_arguments(
-        scenario.simulation, scenario.valve, _head(scenario), scenario.seed, robot_of(scenario).description
-    )
+    robot, simulation = robot_of(scenario), scenario.simulation
+    place: Sequence[float] = (0.0, 0.0, 0.0)
+    if robot.drive.fixed:
+        start = start_of(scenario)
+        place = (start_pose(simulation.start, simulation.valve) if start is None else start.base).tolist()
+    return rig_arguments(simulation, scenario.valve, _head(scenario), scenario.seed, robot.description, place)
 
 
 def _head(scenario: Scenario) -> StereoHead:
@@ -297,7 +297,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     collision = CollisionModel(robot)
     if touching := collision.touching(None, robot.home):
         raise ConfigError(f"{scenario.robot}: arms.left.home and arms.right.home must be free of all: {touching[0]}")
-    stances = Stances(robot, valve, scenario.stance, view, collision.is_free, collision.pairs)
+    stances = Stances(robot, valve, scenario.stance, view, collision.is_free, collision.pairs, robot.drive.fixed)
     return [
         RobotStateSystem(robot.groups),
         ColorSegmentationSystem(scenario.color_segmentation, reach=1.3 * marker.reach()),
@@ -312,13 +312,16 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             robot.waist,
             robot.gaze_signs,
             look=valve.look(),
+            drive=robot.drive,
         ),
-        BaseApproachSystem(_clear(scenario.base_approach, robot), valve),
+        BaseApproachSystem(scenario.base_approach, valve, robot.drive, robot.turning_room),
         StancePlannerSystem(StancePlanner(scenario.stance_planner, stances)),
         KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, robot, valve, area)),
         ImageServoSystem(servo),
         HybridRotationSystem(HybridRotation(scenario.hybrid_rotation, valve, robot, view)),
-        CommandSelectorSystem(scenario.command_selector, initial_commands(scenario), robot.torso, robot.arms),
+        CommandSelectorSystem(
+            scenario.command_selector, initial_commands(scenario), robot.torso, robot.arms, robot.drive
+        ),
         SupervisorSystem(scenario.supervisor, opening=valve.sense),
         *(
             [OperatorChannelSystem(scenario.operator_channel, scenario.angle, scenario.supervisor.angle_limit)]
@@ -326,11 +329,6 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             else []
         ),
     ]
-
-
-def _clear(config: BaseApproachConfig, robot: Robot) -> BaseApproachConfig:
-    """The clearance is at least what the base needs to turn before a panel."""
-    return dc.replace(config, clearance=max(config.clearance, robot.turning_room))
 
 
 def make_diagram(

@@ -124,7 +124,8 @@ class RobotState(Message):
     """All joint-side measurements of one instant, and the head's recent motion."""
 
     time: float = 0.0
-    odometry: np.ndarray = array(5)  # x, y [m], heading [rad], forward [m/s], yaw rate [rad/s]
+    # x, y [m], heading [rad], then the speeds that the base has: forward, sideways [m/s], yaw rate [rad/s]
+    odometry: np.ndarray = _shared(np.zeros(5), (-1,))
     torso: np.ndarray = array(-1)  # lift and waist, if there are; tilt, pan [m, rad]
     left_arm: np.ndarray = array(-1)  # [rad]
     right_arm: np.ndarray = array(-1)
@@ -139,6 +140,11 @@ class RobotState(Message):
     left_wrench: np.ndarray = array(6)  # [torque; force] felt by the sensor, in its frame, raw
     right_wrench: np.ndarray = array(6)
     history: np.ndarray = array(-1, -1)  # rows, oldest first: t, x, y, heading, torso
+
+    @property
+    def twist(self) -> np.ndarray:
+        """The base's speeds, as many as it has."""
+        return self.odometry[3:]
 
     @property
     def posture(self) -> np.ndarray:
@@ -433,7 +439,7 @@ class Command(Message):
     """What a behaviour commands the robot to do. None: it commands nothing to that group."""
 
     time: float = 0.0
-    base_twist: np.ndarray | None = array(2, optional=True)  # forward [m/s], yaw rate [rad/s]
+    base_twist: np.ndarray | None = array(-1, optional=True)  # the speeds that the base has, as in RobotState.odometry
     torso: np.ndarray | None = array(-1, optional=True)  # [m, rad]
     left_arm: np.ndarray | None = array(-1, optional=True)  # [rad]
     right_arm: np.ndarray | None = array(-1, optional=True)

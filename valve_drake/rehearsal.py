@@ -75,6 +75,7 @@ def make_twin(
         scenario.hardware,
         scenario.simulation.camera,
         Faults(scenario.faults, scenario.seed),
+        absent=robot.groups.absent,
         images=workers if isinstance(workers, LiveImages) else None,
         rate=rate,
         lcm=lcm,

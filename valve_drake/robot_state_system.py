@@ -40,7 +40,8 @@ class RobotStateSystem(Block[Inputs, np.ndarray]):
 
     def initial_outputs(self) -> Outputs:
         zeros: dict[str, Any] = {field: np.zeros(self._sizes[port]) for field, port in self._fields.items()}
-        return {"robot_state": RobotState(history=np.zeros((0, self._columns)), **zeros)}
+        odometry = np.zeros(self._sizes["base.odometry"])
+        return {"robot_state": RobotState(odometry=odometry, history=np.zeros((0, self._columns)), **zeros)}
 
     def step(self, time: float, inputs: Inputs, memory: np.ndarray) -> tuple[np.ndarray, Outputs]:
         read = {name: inputs[name] for name in self.INPUTS}

@@ -202,7 +202,7 @@ def _lesson(ports: _Ports, robot: Robot, scenario: Scenario) -> tuple[Taught, Pi
     torso = ports.read("torso.position_measured")
     posture = torso[: len(robot.posture)]
     ports.write("torso.position_command", torso)
-    ports.write("base.twist_command", np.zeros(2))
+    ports.write("base.twist_command", np.zeros(len(robot.drive.names)))
     goals = {side: ports.read(f"{side}_arm.position_measured") for side in SIDES}
     commands = dict(goals)
     _command(ports, commands)

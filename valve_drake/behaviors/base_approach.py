@@ -1,4 +1,4 @@
-"""Stages 1 and 2 on wheels: drives the base (a differential drive) to the stance before the valve, and away again.
+"""Stages 1 and 2 on wheels: drives the base to the stance before the valve, and away again.
 
     rough_approach  turns towards the marker's position of stage 1, drives until it is nearer than 2 m, and brakes.
     fine_approach   by the pose of stage 2, to the stance that kinematic_approach asks for:
@@ -8,7 +8,10 @@
                         line    straight in, steering onto the line through the stance
                         settle  trim heading and distance, wait for the lift, stand still, check
                     A differential drive cannot step sideways: if it ends beside the stance, it backs off and goes
-                    through all phases again.
+                    through all phases again. A holonomic one has two phases:
+                        go      straight to the stance, whichever way it looks, turning to its heading meanwhile
+                        settle  as above, sideways too
+                    A fixed base stays where it is: the stance is there, or the run ends with reach_limit.
     retreat         straight back; the arms are folded.
 
 The base's centre never comes nearer to the panel's plane than `clearance`. A stance nearer than that is refused; from
@@ -21,6 +24,7 @@ Frames: frames.py; everything here is on the floor, in O.
 """
 
 import dataclasses as dc
+import math
 
 import numpy as np
 
@@ -40,11 +44,15 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.motion import slew, towards
+from valve_drake.robot.drive import DIFFERENTIAL, Drive, whole
 from valve_drake.task.modes import owned
 from valve_drake.valve.valve import Valve, has_heading
 
 MODES = owned("base_approach")
 SLIM = 0.15  # so much nearer to an upright axis than to a panel may the base come; lower it for a wide post [m]
+STILL = np.zeros(3)
+STILL.setflags(write=False)
+NEAR = 0.03  # a holonomic base that is within the clearance by more moves away first; above a stance's noise [m]
 RAISED = 0.01  # lift and waist are at the stance's when they are off by less [m, rad]
 
 
@@ -100,6 +108,20 @@ class BaseApproachConfig(Config):
         require(below, f"{key}.rough_stop", f"below rough_distance, {self.rough_distance:g}", self.rough_stop)
 
 
+def within(config: BaseApproachConfig, drive: Drive, room: float) -> BaseApproachConfig:
+    """The config with no more than the base can do, and the room that it needs to turn before a panel [m]."""
+    if drive.fixed:
+        return config
+    speeds = ("speed", "fine_speed", "line_speed", "reverse_speed", "trim_speed", "retreat_speed")
+    most = dict.fromkeys(speeds, float(drive.speed[0])) | {
+        "yaw_rate": float(drive.speed[-1]),
+        "acceleration": float(np.min(drive.acceleration[:-1])),
+        "yaw_acceleration": float(drive.acceleration[-1]),
+    }
+    bounded = {name: min(getattr(config, name), value) for name, value in most.items()}
+    return dc.replace(config, clearance=max(config.clearance, room), **bounded)
+
+
 @dc.dataclass(frozen=True, eq=False)
 class MedianPlace:
     """The median of the last few places (x, y, heading) on the floor: one wild estimate does not move it."""
@@ -125,7 +147,7 @@ class Memory:
     verdict: str = Verdict.NONE.value
     detail: str = ""
     progress: float = 0.0
-    twist: np.ndarray = dc.field(default_factory=lambda: np.zeros(2))  # command [m/s, rad/s]
+    twist: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # command: forward, sideways, yaw [m/s, rad/s]
     start: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # base at the activation [m, m, rad]
     marker: MedianPlace = MedianPlace()  # stage 1: heading means nothing
     first_seen: np.ndarray | None = None  # marker's x, y when it was sure first, and the base's then [m]
@@ -149,6 +171,7 @@ def step(
     position: StereoPosition,
     estimate: RectangleEstimate,
     stance: Stance,
+    drive: Drive = DIFFERENTIAL,
 ) -> tuple[Memory, Command, Status]:
     """One tick of length dt -> memory, command, status."""
     if mode.mode not in MODES:
@@ -160,17 +183,18 @@ def step(
         fresh = MedianPlace(seen=time)
         m = Memory(mode.activation, time, twist=m.twist, start=base, quiet_since=time)
         m = changed(m, marker=fresh, panel=fresh, stance=fresh)
-    goal = np.zeros(2)
+    goal = STILL
     if m.result == "running":
         if mode.mode == Mode.ROUGH_APPROACH:
-            m, goal = _rough(config, m, dt, robot_state, position)
+            m, goal = _rough(config, m, dt, robot_state, position, drive)
         elif mode.mode == Mode.FINE_APPROACH:
-            m, goal = _fine(config, valve, m, time, dt, robot_state, estimate, stance)
+            m, goal = _fine(config, valve, m, time, dt, robot_state, estimate, stance, drive)
         else:
-            m, goal = _retreat(config, m, time, dt, robot_state)
-    m = changed(m, twist=slew(m.twist, goal, np.array([config.acceleration, config.yaw_acceleration]) * dt))
+            m, goal = _retreat(config, m, dt, robot_state, drive)
+    rates = np.array([config.acceleration, config.acceleration, config.yaw_acceleration])
+    m = changed(m, twist=slew(m.twist, goal, rates * dt))
     status = Status(time, m.activation, m.result, m.verdict, m.detail, m.progress)
-    return m, Command(time=time, base_twist=m.twist), status
+    return m, Command(time=time, base_twist=None if drive.fixed else drive.part(m.twist)), status
 
 
 # ---------------------------------------------------------------- common
@@ -178,7 +202,28 @@ def step(
 
 def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") -> tuple[Memory, np.ndarray]:
     progress = 1.0 if result == "succeeded" else m.progress
-    return changed(m, result=result, verdict=str(verdict), detail=detail, progress=progress), np.zeros(2)
+    return changed(m, result=result, verdict=str(verdict), detail=detail, progress=progress), STILL
+
+
+def _motion(forward: float = 0.0, rate: float = 0.0) -> np.ndarray:
+    """Straight on, or on an arc."""
+    return np.array([forward, 0.0, rate])
+
+
+def _towards(
+    config: BaseApproachConfig, drive: Drive, way: np.ndarray, heading: float, speed: float, rate: float, dt: float
+) -> np.ndarray:
+    """A holonomic base's motion along `way`, that stops at its end -> forward, sideways, yaw rate.
+
+    way: (x, y) in the frame that the heading counts in. speed: at most; less where one of the base's own is the limit.
+    """
+    left = math.hypot(*way.tolist())
+    if left == 0.0:
+        return _motion(rate=rate)
+    angle = math.atan2(way[1], way[0]) - heading
+    along = np.array([math.cos(angle), math.sin(angle)])
+    v = _drive(config, left, min(speed, *(drive.speed[:2] / np.maximum(np.abs(along), 1e-9)).tolist()), dt)
+    return np.array([*(v * along), rate])
 
 
 def _drive(config: BaseApproachConfig, gap: float, speed: float, dt: float) -> float:
@@ -193,7 +238,8 @@ def _turn(config: BaseApproachConfig, angle: float, dt: float) -> float:
 
 
 def _still(config: BaseApproachConfig, state: RobotState) -> bool:
-    return abs(state.odometry[3]) < config.still_speed and abs(state.odometry[4]) < config.still_rate
+    forward, sideways, rate = whole(state.twist)
+    return math.hypot(forward, sideways) < config.still_speed and abs(rate) < config.still_rate
 
 
 def _sure(config: BaseApproachConfig, track: MedianPlace) -> bool:
@@ -205,18 +251,18 @@ def _sure(config: BaseApproachConfig, track: MedianPlace) -> bool:
 
 
 def _rough(
-    config: BaseApproachConfig, m: Memory, dt: float, state: RobotState, position: StereoPosition
+    config: BaseApproachConfig, m: Memory, dt: float, state: RobotState, position: StereoPosition, drive: Drive
 ) -> tuple[Memory, np.ndarray]:
     if position.found and position.time > m.marker.seen:
         p_OV = apply(position.X_OL, position.p_LV)
         m = changed(m, marker=m.marker.add(position.time, np.array([p_OV[0], p_OV[1], 0.0]), config.sightings))
     if not m.marker.places:
-        return m, np.zeros(2)
+        return m, STILL
     x, y, heading = state.odometry[:3]
     p = m.marker.median
     m = _watch_odometry(config, m, state.odometry[:2])
     if m.result == "failed":
-        return m, np.zeros(2)
+        return m, STILL
     distance = float(np.hypot(p[0] - x, p[1] - y))
     bearing = wrap(float(np.arctan2(p[1] - y, p[0] - x)) - heading)
     m = changed(
@@ -225,12 +271,20 @@ def _rough(
         progress=float(np.clip(config.rough_distance / distance, 0, 1)),
     )
     if distance < config.rough_distance and _still(config, state):
-        return _end(m, "succeeded", detail=m.detail) if _sure(config, m.marker) else (m, np.zeros(2))
+        return _end(m, "succeeded", detail=m.detail) if _sure(config, m.marker) else (m, STILL)
+    if drive.fixed:
+        if not _sure(config, m.marker):
+            return m, STILL
+        return _end(m, "failed", Verdict.REACH_LIMIT, f"{m.detail}, and the base is fixed")
+    if drive.sideways and distance >= config.rough_distance:
+        left = max(distance - config.rough_stop, 0.0)
+        way, rate = (p[:2] - [x, y]) * (left / distance), _turn(config, bearing, dt)
+        return m, _towards(config, drive, way, float(heading), config.speed, rate, dt)
     forward = 0.0
     if abs(bearing) < config.facing and distance >= config.rough_distance:  # nearer it comes to rest where it is
         forward = _drive(config, max(distance - config.rough_stop, 0.0), config.speed, dt) * np.cos(bearing)
     rate = _turn(config, bearing, dt) if distance > config.rough_stop else 0.0
-    return m, np.array([forward, rate])
+    return m, _motion(forward, rate)
 
 
 def _watch_odometry(config: BaseApproachConfig, m: Memory, base: np.ndarray) -> Memory:
@@ -276,6 +330,7 @@ def _fine(
     state: RobotState,
     estimate: RectangleEstimate,
     stance: Stance,
+    drive: Drive,
 ) -> tuple[Memory, np.ndarray]:
     if estimate.found and estimate.time > m.panel.seen:
         m = changed(m, panel=m.panel.add(estimate.time, _panel(valve, estimate), config.sightings))
@@ -284,23 +339,25 @@ def _fine(
     if not (_sure(config, m.panel) and _sure(config, m.stance)):
         if time - m.since > config.stance_patience:
             return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
-        return changed(m, detail="waiting for a stance"), np.zeros(2)
+        return changed(m, detail="waiting for a stance"), STILL
     goal, panel = m.stance.median, m.panel.median
     if np.isnan(panel[2]):  # an upright axis: a plane behind its post, facing the stance
         panel = np.array([*_ahead(np.array([*panel[:2], goal[2]]), SLIM), goal[2]])
     room = -_offset(goal, panel).s - config.clearance
-    if room < 0:
+    if room < 0 and not drive.fixed:
         return _end(m, "failed", Verdict.REACH_LIMIT, f"the stance is {-room:.3f} m too near to the panel")
     base = state.odometry[:3]
     at = _offset(base, goal)
     if m.phase != "settle":
         m = changed(m, quiet_since=time)  # stillness counts from there on
     if m.phase == "plan":
-        m = _plan(config, m, base, goal, at, _ahead(panel, valve.marker.xyz[2] - valve.panel.depth))
+        m = _plan(config, m, base, goal, at, _ahead(panel, valve.marker.xyz[2] - valve.panel.depth), drive)
         if m.result == "failed":
-            return m, np.zeros(2)
+            return m, STILL
     if m.phase == "settle":
-        m, twist = _settle(config, m, time, dt, state, at)
+        m, twist = _settle(config, m, time, dt, state, at, drive)
+    elif drive.sideways:
+        m, twist = _go(config, drive, m, dt, base, goal, at, _offset(base, panel).s + config.clearance > NEAR)
     else:
         m, twist = PHASES[m.phase](config, m, dt, base, goal, at)
     if m.result == "running":
@@ -332,14 +389,24 @@ def _within(config: BaseApproachConfig, at: _Offset) -> bool:
 
 
 def _plan(
-    config: BaseApproachConfig, m: Memory, base: np.ndarray, goal: np.ndarray, at: _Offset, marker: np.ndarray
+    config: BaseApproachConfig,
+    m: Memory,
+    base: np.ndarray,
+    goal: np.ndarray,
+    at: _Offset,
+    marker: np.ndarray,
+    drive: Drive,
 ) -> Memory:
     """Chooses the first phase of a new attempt. marker: its centre on the floor (2,)."""
     if _within(config, at):
         return changed(m, phase="settle")
+    if drive.fixed:
+        return _end(m, "failed", Verdict.REACH_LIMIT, "the stance is elsewhere, and the base is fixed")[0]
     if m.attempt >= config.attempts:
         return _end(m, "failed", Verdict.REACH_LIMIT, f"still {at.e:+.3f} m aside after {m.attempt} attempts")[0]
     m = changed(m, attempt=m.attempt + 1)
+    if drive.sideways:
+        return changed(m, phase="go")
     # In the funnel before the stance the line law alone brings it in.
     if -2 * config.pre_stance < at.s < 0 and abs(at.e) < -at.s / 8 and abs(at.psi) < config.facing:
         return changed(m, phase="line")
@@ -364,9 +431,9 @@ def _turn_phase(
     config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
     error = _course_error(m, base, _pre_stance(config, goal) - base[:2])
-    if abs(error) < 0.05 and abs(m.twist[1]) < 0.2:
-        return changed(m, phase="drive"), np.zeros(2)
-    return m, np.array([0.0, _turn(config, error, dt)])
+    if abs(error) < 0.05 and abs(m.twist[2]) < 0.2:
+        return changed(m, phase="drive"), STILL
+    return m, _motion(rate=_turn(config, error, dt))
 
 
 def _drive_phase(
@@ -375,56 +442,78 @@ def _drive_phase(
     way = _pre_stance(config, goal) - base[:2]
     left = m.direction * float(way @ [np.cos(base[2]), np.sin(base[2])])
     if left < 0.02:
-        return changed(m, phase="align"), np.zeros(2)
+        return changed(m, phase="align"), STILL
     error = _course_error(m, base, way)
     speed = config.fine_speed if m.direction > 0 else config.reverse_speed
     # Close to the point its direction swings round; the heading is kept there.
     rate = _turn(config, error, dt) if np.linalg.norm(way) > 0.15 else 0.0
     if abs(error) > config.facing and np.linalg.norm(way) > 0.15:
-        return changed(m, phase="turn"), np.array([0.0, rate])
-    return m, np.array([m.direction * _drive(config, left, speed, dt), rate])
+        return changed(m, phase="turn"), _motion(rate=rate)
+    return m, _motion(m.direction * _drive(config, left, speed, dt), rate)
 
 
 def _align_phase(
     config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
-    if abs(at.psi) < 0.03 and abs(m.twist[1]) < 0.1:
+    if abs(at.psi) < 0.03 and abs(m.twist[2]) < 0.1:
         # Too far aside for the line law: a new attempt.
-        return changed(m, phase="line" if abs(at.e) < config.pre_stance / 5 else "plan"), np.zeros(2)
-    return m, np.array([0.0, _turn(config, -at.psi, dt)])
+        return changed(m, phase="line" if abs(at.e) < config.pre_stance / 5 else "plan"), STILL
+    return m, _motion(rate=_turn(config, -at.psi, dt))
 
 
 def _line_phase(
     config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
     if at.s > -0.005:
-        return changed(m, phase="settle"), np.zeros(2)
+        return changed(m, phase="settle"), STILL
     psi_ref = float(-np.arctan(at.e / config.look_ahead))
     rate = float(np.clip(config.steering * wrap(psi_ref - at.psi), -config.yaw_rate, config.yaw_rate))
-    return m, np.array([_drive(config, -at.s, config.line_speed, dt), rate])
+    return m, _motion(_drive(config, -at.s, config.line_speed, dt), rate)
+
+
+def _go(
+    config: BaseApproachConfig,
+    drive: Drive,
+    m: Memory,
+    dt: float,
+    base: np.ndarray,
+    goal: np.ndarray,
+    at: _Offset,
+    near: bool,
+) -> tuple[Memory, np.ndarray]:
+    """Straight to the stance. near: the base is within `clearance` of the panel, and moves away first."""
+    way = (_pre_stance(config, goal) if near else goal[:2]) - base[:2]
+    left = math.hypot(*way.tolist())
+    if not near and left < config.position_tolerance and abs(at.psi) < config.heading_tolerance:
+        return changed(m, phase="settle"), STILL
+    speed = config.line_speed if left < config.pre_stance else config.fine_speed
+    return m, _towards(config, drive, way, float(base[2]), speed, _turn(config, -at.psi, dt), dt)
 
 
 PHASES = {"turn": _turn_phase, "drive": _drive_phase, "align": _align_phase, "line": _line_phase}
 
 
 def _settle(
-    config: BaseApproachConfig, m: Memory, time: float, dt: float, state: RobotState, at: _Offset
+    config: BaseApproachConfig, m: Memory, time: float, dt: float, state: RobotState, at: _Offset, drive: Drive
 ) -> tuple[Memory, np.ndarray]:
     """Trims heading and distance; succeeds when the base has been at rest within the tolerances."""
-    turn = abs(at.psi) > config.heading_tolerance / 3
-    shift = abs(at.s) > config.position_tolerance / 3
+    turn = abs(at.psi) > config.heading_tolerance / 3 and not drive.fixed
+    off = math.hypot(at.s, at.e) if drive.sideways else abs(at.s)
+    shift = off > config.position_tolerance / 3 and not drive.fixed
     rises = _rises(m, state)
-    busy = rises or turn or (shift and abs(at.e) < config.position_tolerance)
+    busy = rises or turn or (shift and (drive.sideways or abs(at.e) < config.position_tolerance))
     if busy or not _still(config, state):
         m = changed(m, quiet_since=time)
     elif time - m.quiet_since >= config.still_time:
         if _within(config, at):
             detail = f"{1e3 * at.s:+.0f} mm along, {1e3 * at.e:+.0f} mm aside, {np.degrees(at.psi):+.2f} deg"
             return _end(m, "succeeded", detail=detail)
-        return changed(m, phase="plan"), np.zeros(2)
+        return changed(m, phase="plan"), STILL
     rate = _turn(config, -at.psi, dt) if turn else 0.0
-    forward = _drive(config, -at.s, config.trim_speed, dt) if shift else 0.0
-    return m, np.array([forward, rate])
+    if drive.sideways:
+        way = np.array([-at.s, -at.e]) if shift else STILL[:2]
+        return m, _towards(config, drive, way, at.psi, config.trim_speed, rate, dt)
+    return m, _motion(_drive(config, -at.s, config.trim_speed, dt) if shift else 0.0, rate)
 
 
 def _rises(m: Memory, state: RobotState) -> bool:
@@ -436,8 +525,10 @@ def _rises(m: Memory, state: RobotState) -> bool:
 
 
 def _retreat(
-    config: BaseApproachConfig, m: Memory, time: float, dt: float, state: RobotState
+    config: BaseApproachConfig, m: Memory, dt: float, state: RobotState, drive: Drive
 ) -> tuple[Memory, np.ndarray]:
+    if drive.fixed:
+        return _end(m, "succeeded", detail="the base is fixed")
     x, y, heading = state.odometry[:3]
     c, s = np.cos(m.start[2]), np.sin(m.start[2])
     back = float(c * (m.start[0] - x) + s * (m.start[1] - y))
@@ -446,4 +537,8 @@ def _retreat(
     if left < 0.01 and _still(config, state):
         return _end(m, "succeeded", detail=f"{back:.2f} m back")
     rate = _turn(config, wrap(float(m.start[2]) - heading), dt)
-    return m, np.array([-_drive(config, max(left, 0.0), config.retreat_speed, dt), rate])
+    if drive.sideways:
+        aside = float(c * (y - m.start[1]) - s * (x - m.start[0]))
+        way = np.array([[c, -s], [s, c]]) @ [-max(left, 0.0), -aside]
+        return m, _towards(config, drive, way, float(heading), config.retreat_speed, rate, dt)
+    return m, _motion(-_drive(config, max(left, 0.0), config.retreat_speed, dt), rate)

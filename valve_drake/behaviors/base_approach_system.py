@@ -1,8 +1,9 @@
 """Block `base_approach`: stages 1 and 2 on ports. No mathematics here."""
 
-from valve_drake.behaviors.base_approach import MODES, BaseApproachConfig, Memory, step
+from valve_drake.behaviors.base_approach import MODES, BaseApproachConfig, Memory, step, within
 from valve_drake.messages import Command, ModeState, RectangleEstimate, RobotState, Stance, Status, StereoPosition
 from valve_drake.ports import TICK, Block, Inputs, Outputs
+from valve_drake.robot.drive import DIFFERENTIAL, Drive
 from valve_drake.valve.valve import Valve
 
 
@@ -24,17 +25,27 @@ class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
     position     in   StereoPosition     stage 1
     estimate     in   RectangleEstimate  stage 2
     stance       in   Stance             where to stand, by kinematic_approach
-    command      out  Command            base_twist, in its modes
+    command      out  Command            base_twist, in its modes, unless the base is fixed
     status       out  Status
+
+    drive: of the robot's base. room: what it needs to turn before a panel, which the clearance is at least [m].
     """
 
     AWAKE = frozenset(MODES)
     OUTPUTS = {"command": Command, "status": Status}
 
-    def __init__(self, config: BaseApproachConfig, valve: Valve, name: str = "base_approach"):
+    def __init__(
+        self,
+        config: BaseApproachConfig,
+        valve: Valve,
+        drive: Drive = DIFFERENTIAL,
+        room: float = 0.0,
+        name: str = "base_approach",
+    ):
         config.check()
-        self.config = config
+        self.config = within(config, drive, room)
         self.valve = valve
+        self.drive = drive
         super().__init__(name, period=2 * TICK)
 
     def initial(self) -> Memory:
@@ -52,5 +63,6 @@ class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
             inputs.position,
             inputs.estimate,
             inputs.stance,
+            self.drive,
         )
         return memory, {"command": command, "status": status}

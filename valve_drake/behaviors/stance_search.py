@@ -54,7 +54,9 @@ class StanceSearch:
 
 @dc.dataclass(frozen=True, eq=False)
 class Stances(GraspSearch):
-    """Which turns the hands can follow, and from where."""
+    """Which turns the hands can follow, and from where. bolted: only from where the robot is, the origin of O."""
+
+    bolted: bool = False
 
     def __post_init__(self) -> None:
         self.config.distances(self.robot.stand)
@@ -74,7 +76,7 @@ class Stances(GraspSearch):
         posture = self.robot.posture.home if last.best.posture is None else last.best.posture
         places, dense = self._places(X_OA, viewer, posture)
         afresh = StanceSearch(X_OA, turn_angle, places, kept=self.robot.lift > 0, dense=dense)
-        if self.robot.lift or (last.found_in == 0 and last.margin >= self.config.margin_good):
+        if self.bolted or self.robot.lift or (last.found_in == 0 and last.margin >= self.config.margin_good):
             return afresh
         there = Place(_moved(last.best.base, last.X_OA, X_OA), last.best.posture)
         return StanceSearch(
@@ -98,7 +100,7 @@ class Stances(GraspSearch):
         left = np.array([-np.sin(angle), np.cos(angle)])
         stem = compose(X_OA, self.valve.X_AP())[:2, 3]  # at the panel
         distances = c.distances(self.robot.stand)
-        every = [_before(stem, distance, angle) for distance in distances]
+        every = [np.zeros(3)] if self.bolted else [_before(stem, distance, angle) for distance in distances]
         thin = -(-len(every) // FEW)
         distances, bases = distances[::thin], every[::thin]
         home = self.robot.posture.home
@@ -109,6 +111,8 @@ class Stances(GraspSearch):
         raised = self._postures()
         if raised:
             groups.append(tuple(Place(base, posture) for posture in raised for base in bases))
+        if self.bolted:
+            return tuple(groups), len(groups)
         if not has_heading(X_OA):  # a valve that lies flat is turned from any side
             groups += [tuple(Place(_before(stem, d, angle + off)) for d in distances) for off in AROUND]
         elif c.aside > 0:

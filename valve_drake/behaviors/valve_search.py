@@ -7,6 +7,8 @@ Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base w
              `pitches`. A sighting stops the sweep and is centred; it counts when the last `sightings` of stage 1 agree
              within 3 sigma or 5 % of the distance, else the sweep goes on. Fails with not_found after the last round.
              The gaze waits for images, so that a slow camera makes the search slower and not blind.
+             A fixed base does not turn: then a round is one sweep, and the rounds go on downwards as far as the head
+             does, since a valve that such a robot can reach is near (`bolted`).
     others   The neck keeps the last known p_OV on the optical axis of the left camera, the waist comes back to zero;
              only while driving it helps when the neck is at its end.
              Without a sighting for `lost_after` while driving or measuring: failed with marker_lost.
@@ -36,10 +38,12 @@ from valve_drake.messages import (
     Verdict,
 )
 from valve_drake.motion import follow, slew, towards
+from valve_drake.robot.drive import DIFFERENTIAL, Drive
 from valve_drake.task.modes import HOLD, TABLE, WATCHED
 
 HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading) in O, torso (3,) -> X_OL (3, 4)
 
+LOWER = 0.22  # between two rounds of a fixed robot, less than the eyes see at once; lower it for longer lenses [rad]
 DRIVING = tuple(mode for mode in WATCHED if TABLE[mode].base != HOLD)
 
 
@@ -194,6 +198,7 @@ def step(
     estimate: RectangleEstimate,
     head_pose: HeadPose,
     look: np.ndarray | None = None,
+    drive: Drive = DIFFERENTIAL,
 ) -> tuple[Memory, Command, Status]:
     """One tick of length dt -> memory, command, status. look: where to look, off the marker's middle, in V (3,)."""
     m = memory
@@ -209,8 +214,8 @@ def step(
 
     twist = None
     if mode.mode == Mode.SEARCH:
-        m, goal = _search(config, m, time, dt, base, position, head_pose)
-        twist = np.array([0.0, m.turn_rate])
+        m, goal = _search(config, m, time, dt, base, position, head_pose, _sweeps(drive))
+        twist = None if drive.fixed else drive.part(np.array([0.0, 0.0, m.turn_rate]))
     else:
         m = _sight(config, m, position, estimate)
         if mode.mode in WATCHED and m.result == "running":
@@ -226,7 +231,7 @@ def step(
     ]
     torso, velocity = np.array(new), np.array([(after - before) / dt for after, before in zip(new, now)])
     m = changed(m, torso=torso, velocity=velocity, goal=goal)
-    return m, Command(time=time, torso=torso, base_twist=twist), _status(config, m, time, mode)
+    return m, Command(time=time, torso=torso, base_twist=twist), _status(config, m, time, mode, _sweeps(drive))
 
 
 def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
@@ -256,12 +261,25 @@ def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") 
     return changed(m, result=result, verdict=str(verdict), detail=detail)
 
 
-def _status(config: ValveSearchConfig, m: Memory, time: float, mode: ModeState) -> Status:
+def bolted(config: ValveSearchConfig) -> ValveSearchConfig:
+    """The config of a search without a base that turns."""
+    steeper = np.arange(max(config.pitches) + LOWER, config.pitch_high, LOWER).tolist()
+    first = [pitch for pitch in sorted(config.pitches) if pitch >= config.pitches[0]]
+    rest = [pitch for pitch in config.pitches if pitch not in first]
+    return dc.replace(config, pitches=[*first, *steeper, *rest])
+
+
+def _sweeps(drive: Drive) -> int:
+    """Of a round."""
+    return 1 if drive.fixed else 2
+
+
+def _status(config: ValveSearchConfig, m: Memory, time: float, mode: ModeState, sweeps: int) -> Status:
     if mode.mode != Mode.SEARCH and mode.mode not in WATCHED:
         return Status(time=time, activation=mode.activation)
     progress = 0.0
     if mode.mode == Mode.SEARCH:
-        progress = 1.0 if m.result == "succeeded" else max(m.sweeps, 0) / (2 * len(config.pitches))
+        progress = 1.0 if m.result == "succeeded" else max(m.sweeps, 0) / (sweeps * len(config.pitches))
     return Status(time, mode.activation, m.result, m.verdict, m.detail, progress)
 
 
@@ -325,8 +343,9 @@ def _search(
     base: np.ndarray,
     position: StereoPosition,
     head_pose: HeadPose,
+    sweeps: int,
 ) -> tuple[Memory, np.ndarray]:
-    """One tick of the search -> memory, torso goal."""
+    """One tick of the search -> memory, torso goal. sweeps: of a round; between two the base turns."""
     turned = wrap(float(base[2]) - m.heading)
     m = changed(m, heading=float(base[2]), to_turn=m.to_turn - turned if m.to_turn else 0.0)
     if m.result == "running":
@@ -340,7 +359,7 @@ def _search(
             return m, m.goal
         neck = aim(head_pose, base, m.goal, m.looks[-1][0])
         return m, np.array([m.goal[0], *_neck(config, *neck)])
-    return _sweep(config, m, dt, float(base[2]))
+    return _sweep(config, m, dt, float(base[2]), sweeps)
 
 
 def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPosition) -> Memory:
@@ -367,10 +386,10 @@ def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPos
     return _end(m, "succeeded", detail=f"marker {distance:.2f} m away, {p_OV[2]:.2f} m high")
 
 
-def _sweep(config: ValveSearchConfig, m: Memory, dt: float, heading: float) -> tuple[Memory, np.ndarray]:
-    """Moves the gaze on, or the base between two sweeps -> memory, torso goal."""
+def _sweep(config: ValveSearchConfig, m: Memory, dt: float, heading: float, round_: int) -> tuple[Memory, np.ndarray]:
+    """Moves the gaze on, or the base between two sweeps -> memory, torso goal. round_: sweeps of one."""
     end = config.sweep_yaw + config.sweep_waist
-    pitch = config.pitches[max(m.sweeps, 0) // 2]
+    pitch = config.pitches[max(m.sweeps, 0) // round_]
     goal = _sweep_torso(config, m.gaze, pitch)
     if abs(m.to_turn) > 0.05:
         rate = towards(m.to_turn, config.turn_speed, config.turn_acceleration, dt)
@@ -384,9 +403,10 @@ def _sweep(config: ValveSearchConfig, m: Memory, dt: float, heading: float) -> t
     m = changed(m, gaze=float(gaze))
     if gaze == m.side * end:
         sweeps = m.sweeps + 1
-        m = changed(m, sweeps=sweeps, side=-m.side, to_turn=m.side * np.pi if sweeps % 2 == 1 else 0.0)
-        if sweeps == 2 * len(config.pitches):
-            m = _end(m, "failed", Verdict.NOT_FOUND, f"no marker in {sweeps} sweeps all round")
+        m = changed(m, sweeps=sweeps, side=-m.side, to_turn=m.side * np.pi if sweeps % round_ == 1 else 0.0)
+        if sweeps == round_ * len(config.pitches):
+            where = "all round" if round_ > 1 else "as far as the head turns"
+            m = _end(m, "failed", Verdict.NOT_FOUND, f"no marker in {sweeps} sweeps {where}")
             return m, goal
     return m, _sweep_torso(config, m.gaze, pitch)
 

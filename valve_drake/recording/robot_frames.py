@@ -48,7 +48,8 @@ class RobotFrames:
     def __call__(self, state: RobotState, estimate: RectangleEstimate, plan: GraspPlan, turn: TurnState) -> Transforms:
         """(parent, child, X) of all bodies, the head cameras and the valve; poses a display model only."""
         q = self._q.copy()
-        q[self._slots["base"]] = state.odometry[:3]
+        if base := self._slots["base"]:
+            q[base] = state.odometry[:3]
         q[self._slots["torso"]] = state.torso
         for side in SIDES:
             q[self._slots[side]] = getattr(state, f"{side}_arm")

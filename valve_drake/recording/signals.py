@@ -53,7 +53,7 @@ from valve_drake.recording import foxglove
 from valve_drake.recording.recorder_system import ONCE, Signal
 from valve_drake.recording.refilled import STAMP, Refilled, slot
 from valve_drake.recording.schemas import Encoded, Vector, Wrench, proto_class, serialized
-from valve_drake.robot.groups import Groups
+from valve_drake.robot.groups import POSE, Groups
 from valve_drake.task.modes import BEHAVIORS
 
 SLOW = 1 / 32  # period of large messages and of those that only people look at [s]
@@ -107,13 +107,7 @@ CONTACTS = "truth.contacts"
 def measured(groups: Groups) -> dict[str, tuple[str, ...]]:
     """Ports of the station with what its joints do -> <joint>.<quantity> of each of their values."""
     out: dict[str, tuple[str, ...]] = {
-        "base.odometry": (
-            "base_x.position",
-            "base_y.position",
-            "base_heading.position",
-            "base_forward.velocity",
-            "base_heading.velocity",
-        ),
+        "base.odometry": (*(f"base_{name}.position" for name in POSE), *_speeds(groups)),
         "torso.position_measured": tuple(f"{joint}.position" for joint in groups.torso),
     }
     for side in SIDES:
@@ -130,10 +124,8 @@ def measured(groups: Groups) -> dict[str, tuple[str, ...]]:
 
 def commanded(groups: Groups) -> dict[str, tuple[str, ...]]:
     """The same of the station's inputs."""
-    out: dict[str, tuple[str, ...]] = {
-        "base.twist_command": ("base_forward.velocity", "base_heading.velocity"),
-        "torso.position_command": tuple(f"{joint}.position" for joint in groups.torso),
-    }
+    out: dict[str, tuple[str, ...]] = {"base.twist_command": _speeds(groups)} if groups.twist else {}
+    out["torso.position_command"] = tuple(f"{joint}.position" for joint in groups.torso)
     for side in SIDES:
         out |= {
             f"{side}_arm.position_command": tuple(f"{joint}.position" for joint in groups.names(f"{side}_arm")),
@@ -141,6 +133,11 @@ def commanded(groups: Groups) -> dict[str, tuple[str, ...]]:
             f"{side}_gripper.force_limit": (f"{side}_gripper.effort",),
         }
     return out
+
+
+def _speeds(groups: Groups) -> tuple[str, ...]:
+    """Of the base."""
+    return tuple(f"base_{'heading' if name == 'yaw_rate' else name}.velocity" for name in groups.twist)
 
 
 # Vectors that the recorder reads through one port, which is cheaper: its name -> of a robot, the ports that it joins.

@@ -2,8 +2,6 @@
 
 A description names joints and frames of the model; whether the model has them is checked where it is read
 (robot/model.py, robot/robot.py). SI units and radians. A list of joints goes from the body outwards.
-
-Checked and not yet used: base.speed and base.acceleration (command_selector has its own).
 """
 
 import dataclasses as dc
@@ -15,35 +13,36 @@ from valve_drake.checks import ConfigError, require, shown
 from valve_drake.config import Config, choice, named, names, number, numbers, plain, texts
 from valve_drake.messages import SIDES
 from valve_drake.robot import packages
+from valve_drake.robot.drive import SPEEDS
 
 MOST_JOINTS = 10  # of an arm or a lift
 FAR = 100.0  # of a joint's position: a bound for continuous ones, which have no limits of their own [rad, m]
 PACKAGE = "valve_drake_models"
 OURS = "robot/robot.yaml"  # our own robot, below models/
-DRIVES = {"differential": 2, "holonomic": 3, "fixed": 0}  # how many speeds each has
 TORQUE = "torque"
 
 
 @dc.dataclass
 class BaseDescription(Config):
-    """Key `base`. The frame is B of frames.py. A holonomic base drives as a differential one, for the present.
+    """Key `base`. The frame is B of frames.py. A fixed base is bolted down: nothing drives, and speed and acceleration
+    mean nothing.
 
     stand: nearest and farthest place before a panel that are tried; by default from where the footprint is clear of it
     to where the arms end.
     """
 
     frame: str = plain("", "link or frame on the floor, x forward, z up")
-    drive: str = choice("differential", tuple(DRIVES), "how it moves")
+    drive: str = choice("differential", tuple(SPEEDS), "how it moves")
     footprint: list[float] = numbers([0.3, 0.3], 0.05, 2.0, "half length, half width [m]")
     stand: list[float] = numbers([], 0.3, 3.0, "its frame to the panel, along the floor [m]", count=(0, 2))
-    speed: list[float] = numbers([0.8, 1.2], 0.01, 3.0, "forward, (sideways,) yaw [m/s, rad/s]", count=(0, 3))
+    speed: list[float] = numbers([0.8, 1.2], 0.01, 3.0, "at most: forward, (sideways,) yaw [m/s, rad/s]", count=(0, 3))
     acceleration: list[float] = numbers([0.8, 2.0], 0.05, 5.0, "of the same [m/s^2, rad/s^2]", count=(0, 3))
 
     def relations(self, key: str) -> None:
         require(bool(self.frame), f"{key}.frame", "given", self.frame)
         good = not self.stand or (len(self.stand) == 2 and self.stand[0] <= self.stand[1])
         require(good, f"{key}.stand", "none, or the nearest and the farthest", self.stand)
-        count = DRIVES[self.drive]
+        count = len(SPEEDS[self.drive])
         if count:
             for name in ("speed", "acceleration"):
                 value = getattr(self, name)
@@ -80,8 +79,9 @@ class ArmDescription(Config):
 
     home: free of all, and out of the eyes' sight of the valve. work: where a redundant arm is drawn to at the valve,
     and where the search for a pose begins; home by default. stiffness: of the simulated servos; the model's own by
-    default. sensor: the fixed joint whose load the wrist sensor reads, or `torque` for an arm that has none (then the
-    wrench comes from its joint torques).
+    default. sensor: the fixed joint whose load the wrist sensor reads, or `torque` for an arm that has none: the wrench
+    is computed from its joints' torques. torque_noise, torque_bias: standard deviations of a reading of these, and of
+    its constant error; only with `sensor: torque`, which asks for the first.
     """
 
     joints: list[str] = names("of the model, from the shoulder on", (0, MOST_JOINTS))
@@ -89,6 +89,8 @@ class ArmDescription(Config):
     work: list[float] = numbers([], -FAR, FAR, "[rad]", count=(0, MOST_JOINTS))
     stiffness: list[float] = numbers([], 1.0, 1e5, "of each joint's servo [N m/rad]", count=(0, MOST_JOINTS))
     sensor: str = plain("", "fixed joint beyond the arm, or torque")
+    torque_noise: list[float] = numbers([], 1e-4, 100.0, "of each joint's torque reading [N m]", count=(0, MOST_JOINTS))
+    torque_bias: list[float] = numbers([], 0.0, 100.0, "constant error of the same [N m]", count=(0, MOST_JOINTS))
 
     def relations(self, key: str) -> None:
         count = len(self.joints)
@@ -98,6 +100,14 @@ class ArmDescription(Config):
             if getattr(self, name):
                 _as_many(self, key, name, count)
         require(bool(self.sensor), f"{key}.sensor", f"a fixed joint of the model, or {TORQUE}", self.sensor)
+        if self.sensor == TORQUE:
+            require(count >= 6, f"{key}.sensor", f"a fixed joint: {TORQUE} needs 6 joints or more", self.sensor)
+            _as_many(self, key, "torque_noise", count)
+            if self.torque_bias:
+                _as_many(self, key, "torque_bias", count)
+        for name in ("torque_noise", "torque_bias"):
+            given = getattr(self, name)
+            require(not given or self.sensor == TORQUE, f"{key}.{name}", f"left out without sensor: {TORQUE}", given)
 
 
 @dc.dataclass

@@ -33,6 +33,8 @@ _ENOUGH = 0.5  # margin at which no further seed is tried
 _ROOM = math.radians(40)  # to a joint limit that is comfortable
 _SINGULAR, _REGULAR = 0.05, 0.20  # least singular value of the scaled Jacobian at margins 0 and 1
 
+_FELT = np.array([50.0] * 3 + [200.0] * 3)  # standard deviation of what a hand may feel; hardly matters [N m, N]
+
 _UNITS = np.array([[1.0]] * 3 + [[LENGTH]] * 3)  # of a Jacobian's rows, for angles and lengths to compare
 
 PoseAndJacobian = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # q (n,) -> X_BG (3, 4), J (6, n): [w; v] in B
@@ -196,6 +198,19 @@ def search(
         if most > _ENOUGH:
             break
     return best
+
+
+def wrench(J: np.ndarray, load: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """The likeliest [torque; force] on a hand, for what it adds to the joints' loads (6,).
+
+    J: of the hand (6, n). load: of the joints, J^T wrench and noise (n,); noise: its standard deviation (n,) [N m].
+    Wrenches are expected to be of the size _FELT: that decides where the joints tell nothing.
+    """
+    weighed = J / noise**2
+    A = weighed @ J.T
+    A.flat[::7] += _FELT**-2.0
+    out: np.ndarray = np.linalg.solve(A, weighed @ load)
+    return out
 
 
 def margin(q: np.ndarray, J: np.ndarray, arm: Arm) -> float:

@@ -1,5 +1,6 @@
 """The robot's model in Drake, made from its description; names of joints and frames in it."""
 
+import contextlib
 import dataclasses as dc
 import difflib
 import xml.etree.ElementTree as ElementTree
@@ -21,6 +22,7 @@ from pydrake.multibody.tree import (
     RigidBody,
     SpatialInertia,
     UnitInertia,
+    WeldJoint,
 )
 
 from valve_drake import resources
@@ -77,16 +79,20 @@ def _first(text: str) -> str:
     return shown(lines[0]).strip("'\"") if lines else "no reason given"
 
 
-def add_robot(plant: MultibodyPlant, robot: RobotDescription) -> ModelInstanceIndex:
+def add_robot(
+    plant: MultibodyPlant, robot: RobotDescription, place: Sequence[float] = (0.0, 0.0, 0.0)
+) -> ModelInstanceIndex:
     """Adds the robot to a plant that is not finalized: welds, frames, base joints, actuators, gravity.
 
+    place: x, y, heading where a fixed base is bolted to the floor; another one is put anywhere by its joints [m, rad].
     Raises ConfigError in one line: a name that the model lacks, a file that cannot be read.
     """
     path = model_file(robot)
     model = parse(plant, path, robot.colors)
     efforts = {name: effort for name, effort, _ in _file_joints(path) if effort is not None}
     if robot.weld:
-        _weld(plant, model, robot)
+        with _free_of_constraints(plant, model, robot, "weld must be empty"):
+            _weld(plant, model, robot)
     for name, frame in robot.frames.items():
         if plant.HasFrameNamed(name, model):
             raise ConfigError(f"frames.{name}: the model has a frame of this name")
@@ -98,8 +104,9 @@ def add_robot(plant: MultibodyPlant, robot: RobotDescription) -> ModelInstanceIn
         root = _root(plant, model, base.body())
         if robot.base.drive != "fixed":
             _add_carriages(plant, model, root)
-        elif root.index() != plant.world_body().index():
-            plant.WeldFrames(plant.world_frame(), root.body_frame())
+        else:
+            with _free_of_constraints(plant, model, robot, "base.drive must be one that moves"):
+                _bolt(plant, model, root, base.body(), place)
     for key, name in named_joints(robot):
         joint = joint_named(plant, model, name, key)
         if joint.num_velocities() != 1:
@@ -139,15 +146,28 @@ def _pad_points(robot: RobotDescription) -> dict[str, list[PadPoints]]:
     return out
 
 
-def _weld(plant: MultibodyPlant, model: ModelInstanceIndex, robot: RobotDescription) -> None:
-    """Drake removes no joint while the plant has constraints: they are taken out and put back."""
+@contextlib.contextmanager
+def _free_of_constraints(
+    plant: MultibodyPlant, model: ModelInstanceIndex, robot: RobotDescription, refusal: str
+) -> Iterator[None]:
+    """Drake removes no joint while the plant has constraints: they are taken out and put back.
+
+    Raises ConfigError with the refusal for constraints other than mimics.
+    """
     followers = mimics(robot)
     constraints = plant.GetConstraintIds()
     known = sum(mimic is not None for _, _, mimic in _file_joints(model_file(robot)))
     if len(constraints) > known:
-        raise ConfigError("weld must be empty for a model with constraints other than mimics")
+        raise ConfigError(f"{refusal} for a model with constraints other than mimics")
     for constraint in constraints:
         plant.RemoveConstraint(constraint)
+    yield
+    for mimic in followers:
+        pair = [joint_named(plant, model, name, f"mimic of {mimic.joint}") for name in (mimic.joint, mimic.follows)]
+        plant.AddCouplerConstraint(*pair, mimic.multiplier, mimic.offset)
+
+
+def _weld(plant: MultibodyPlant, model: ModelInstanceIndex, robot: RobotDescription) -> None:
     for k, name in enumerate(robot.weld):
         joint = joint_named(plant, model, name, f"weld[{k}]")
         parent, child = joint.frame_on_parent(), joint.frame_on_child()
@@ -160,9 +180,6 @@ def _weld(plant: MultibodyPlant, model: ModelInstanceIndex, robot: RobotDescript
         except RuntimeError as error:
             raise ConfigError(f"weld[{k}]: {shown(name)} cannot be welded: {_first(str(error))}") from error
         plant.WeldFrames(parent, child)
-    for mimic in followers:
-        pair = [joint_named(plant, model, name, f"mimic of {mimic.joint}") for name in (mimic.joint, mimic.follows)]
-        plant.AddCouplerConstraint(*pair, mimic.multiplier, mimic.offset)
 
 
 def named_joints(robot: RobotDescription) -> Iterator[tuple[str, str]]:
@@ -206,6 +223,26 @@ def _root(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> 
     while (joint := parent_joint(plant, model, body)) is not None:
         body = joint.parent_body()
     return body
+
+
+def _bolt(
+    plant: MultibodyPlant, model: ModelInstanceIndex, root: RigidBody, base: RigidBody, place: Sequence[float]
+) -> None:
+    """Welds a fixed robot to the floor; one that its file welds to the world stands there instead."""
+    X_WPlace = RigidTransform(RollPitchYaw(0.0, 0.0, place[2]), [place[0], place[1], 0.0])
+    if root.index() != plant.world_body().index():
+        plant.WeldFrames(plant.world_frame(), root.body_frame(), X_WPlace)
+        return
+    joint = parent_joint(plant, model, base)
+    assert joint is not None  # the base hangs on the world
+    while joint.parent_body().index() != root.index():
+        joint = parent_joint(plant, model, joint.parent_body())
+        assert joint is not None
+    parent, child = joint.frame_on_parent(), joint.frame_on_child()
+    assert isinstance(joint, WeldJoint)  # no joint of a fixed base moves
+    X_WChild = parent.GetFixedPoseInBodyFrame() @ joint.X_FM()
+    plant.RemoveJoint(joint)
+    plant.WeldFrames(plant.world_frame(), child, X_WPlace @ X_WChild)
 
 
 def _add_carriages(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> None:

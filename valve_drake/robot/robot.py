@@ -16,7 +16,14 @@ from typing import Any
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, JacobianWrtVariable, Joint, ModelInstanceIndex, PrismaticJoint
+from pydrake.multibody.tree import (
+    Frame,
+    JacobianWrtVariable,
+    Joint,
+    ModelInstanceIndex,
+    MultibodyForces,
+    PrismaticJoint,
+)
 
 from valve_drake.checks import ConfigError, require, shown
 from valve_drake.frames import compose, inverse, planar
@@ -24,6 +31,7 @@ from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.robot import description as descriptions
 from valve_drake.robot import kinematics
 from valve_drake.robot.description import TORQUE, RobotDescription
+from valve_drake.robot.drive import Drive, drive
 from valve_drake.robot.groups import Groups
 from valve_drake.robot.kinematics import Arm, HandLoad, Joints
 from valve_drake.robot.model import (
@@ -93,6 +101,7 @@ class Robot:
     description: RobotDescription
     model: Model
     base: Joints  # x, y, yaw; none if it is fixed
+    drive: Drive  # its speeds
     posture: Joints  # lift and waist: what holds still while the hands work
     torso: Joints  # posture, tilt, pan
     arms: Mapping[str, Arm]
@@ -110,6 +119,7 @@ class Robot:
         self.opening = d.opening
         frame = frame_named(plant, index, d.base.frame, "base.frame")
         self.base = _base(plant, index, d, frame)
+        self.drive = drive(d.base.drive, d.base.speed, d.base.acceleration)
         lift = [joint[f"lift.joints[{k}]"] for k in range(len(d.lift.joints))]
         gaze = {key: joint[f"gaze.{key}"] for key in ("waist", "tilt", "pan") if f"gaze.{key}" in joint}
         held = [*lift, *(gaze[key] for key in ("waist",) if key in gaze)]
@@ -192,8 +202,19 @@ class Robot:
 
     @property
     def groups(self) -> Groups:
-        """The joints that are commanded by position."""
-        return Groups(self.torso.names, self.arms[LEFT].names, self.arms[RIGHT].names)
+        """The joints that are commanded by position, the base's speeds, and the devices that there are none of."""
+        absent = [f"{side}_wrist_sensor" for side in SIDES if self.feels_by_torque(side)]
+        return Groups(
+            self.torso.names,
+            self.arms[LEFT].names,
+            self.arms[RIGHT].names,
+            self.drive.names,
+            (*(["base"] if self.drive.fixed else []), *absent),
+        )
+
+    def feels_by_torque(self, side: str) -> bool:
+        """Whether an arm has no force sensor: its wrench is that of its joints' torques (`torque_wrench`)."""
+        return self.description.arm(side).sensor == TORQUE
 
     @staticmethod
     def load(path: str | Path, valve: Valve | None = None) -> "Robot":
@@ -294,6 +315,29 @@ class Robot:
     def margin(self, side: str, q: np.ndarray) -> float:
         """Of an arm from its limits and singularities: 1 is comfortable, 0 at a limit, negative beyond."""
         return kinematics.margin(q, self.jacobian(side, q), self.arms[side])
+
+    # ------------------------------------------------------------ forces without a sensor
+    def torque_wrench(
+        self, side: str, q: np.ndarray, velocity: np.ndarray, torque: np.ndarray, posture: np.ndarray | None = None
+    ) -> np.ndarray:
+        """What a hand feels, of its arm's joints (n,), their rates and the torques of their actuators.
+
+        -> [torque; force] of the world on the hand, at and in G (6,), no weight in it. The arm's own acceleration
+        counts as a force. Joints that tell nothing of a direction, near a singularity, leave it near zero.
+        """
+        chain, d = self._chains[side], self.description.arm(side)
+        self._set(chain, q, posture)
+        plant, context = self._plant, self._context
+        v = np.zeros(plant.num_velocities())
+        v[chain.v] = velocity
+        plant.SetVelocities(context, v)
+        forces = MultibodyForces(plant)
+        plant.CalcForceElementsContribution(context, forces)  # gravity, the joints' damping
+        free = plant.CalcInverseDynamics(context, np.zeros_like(v), forces)[chain.v]
+        R_BG = self._pose(chain.grip)[:, :3]
+        F_B = kinematics.wrench(self._jacobian(chain), free - torque, np.array(d.torque_noise))
+        plant.SetVelocities(context, np.zeros_like(v))
+        return np.concatenate([F_B[:3] @ R_BG, F_B[3:] @ R_BG])
 
     # ------------------------------------------------------------ for who has a plant or a Context of his own
     def named(
@@ -436,8 +480,8 @@ class Robot:
         """Mass and centre of mass of all bodies beyond the sensor, grippers open, in the sensor's frame."""
         plant, index, d = self._plant, self.model.robot, self.description
         key, name, chain = f"arms.{side}.sensor", d.arm(side).sensor, self._chains[side]
-        if name == TORQUE:
-            raise ConfigError(f"{key}: torque is not supported yet; name a fixed joint between arm and hand")
+        if name == TORQUE:  # the model bears the weight, and the wrench is that at the grip point
+            return HandLoad(0.0, _locked(np.zeros(3)), _locked(np.eye(3, 4)))
         sensor = joint_named(plant, index, name, key)
         carried = _carriers(plant, index, chain.grip)
         last = self.arms[side].names[-1]
@@ -520,6 +564,7 @@ def _base(plant: MultibodyPlant, index: ModelInstanceIndex, d: RobotDescription,
     good = kinds == ["prismatic", "prismatic", "revolute"]
     require(good, "base.frame", "moved by two prismatic and one revolute joint of the model, or by none", d.base.frame)
     speed = d.base.speed
+    _check_speeds("base.speed", [chain[0], *chain[3 - len(speed) + 1 :]], speed)
     return _joints(chain, [speed[0], speed[-2], speed[-1]], [0.0, 0.0, 0.0])
 
 

@@ -12,7 +12,7 @@ import dataclasses as dc
 import functools
 import math
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -167,11 +167,13 @@ class CameraRig:
         camera: CameraConfig,
         seed: int,
         robot: RobotDescription | None = None,
+        place: Sequence[float] = (0.0, 0.0, 0.0),
     ):
+        """place: of a fixed base, see add_scene."""
         builder = DiagramBuilder()
         self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1.0)
         scene_graph.set_name("scene_graph")
-        self.scene = add_scene(self.plant, valve, shape, robot)
+        self.scene = add_scene(self.plant, valve, shape, robot, place)
         self.plant.Finalize()
         _draw_finely(self.plant, scene_graph, self.scene.valve)
         self._lensed = {name: _Lensed(mount.lens) for name, mount in mounts.items()}

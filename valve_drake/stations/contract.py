@@ -5,8 +5,9 @@ A station is a Diagram: simulated, hardware or replay. Only the simulated one ma
 """
 
 import dataclasses as dc
+from collections.abc import Callable, Mapping
 
-from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, PortDataType
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, PortDataType
 
 from valve_drake.messages import CAMERAS as CAMERAS
 from valve_drake.messages import SIDES, CameraFrame, Health
@@ -15,11 +16,15 @@ from valve_drake.robot.groups import Groups
 HEAD, WRISTS = CAMERAS[:2], CAMERAS[2:]
 MATE = {HEAD[0]: HEAD[1], HEAD[1]: HEAD[0], WRISTS[0]: WRISTS[1], WRISTS[1]: WRISTS[0]}  # the other one of a pair
 TRUTH = "truth."
+SAID_BY = {  # devices that a robot may lack (Groups.absent) -> the port that shows what they say
+    "base": "base.odometry",
+    **{f"{side}_wrist_sensor": f"{side}_wrist.wrench" for side in SIDES},
+}
 
 
 @dc.dataclass(frozen=True)
 class PortSpec:
-    """One row of the contract. kind: size of a vector, the group of joints that it is of, or a message class."""
+    """One row of the contract. kind: size of a vector, the group of Groups that it is of, or a message class."""
 
     name: str
     direction: str  # in | out
@@ -35,12 +40,14 @@ def _both(name: str, direction: str, kind: int | str, unit: str, notes: str = ""
 
 
 CONTRACT: tuple[PortSpec, ...] = (
-    PortSpec("base.twist_command", "in", 2, "m/s, rad/s", "forward, yaw rate"),
+    PortSpec(
+        "base.twist_command", "in", "twist", "m/s, rad/s", "those that the base has of forward, sideways, yaw rate"
+    ),
     PortSpec("torso.position_command", "in", "torso", "rad, m", "lift and waist, if there are; tilt, pan"),
     *_both("arm.position_command", "in", "arm", "rad"),
     *_both("gripper.position_command", "in", 1, "m", "opening between the pads"),
     *_both("gripper.force_limit", "in", 1, "N", "of the finger actuator"),
-    PortSpec("base.odometry", "out", 5, "m, rad, m/s, rad/s", "x, y, heading, forward, yaw rate; drifts"),
+    PortSpec("base.odometry", "out", "odometry", "m, rad, m/s, rad/s", "x, y, heading, and these speeds; drifts"),
     PortSpec("torso.position_measured", "out", "torso", "rad, m"),
     *_both("arm.position_measured", "out", "arm", "rad"),
     *_both("arm.velocity_measured", "out", "arm", "rad/s"),
@@ -89,16 +96,27 @@ def check_contract(station: Diagram, groups: Groups) -> None:
         raise TypeError(f"{station.get_name()} breaks the station contract: " + "; ".join(wrong))
 
 
-def station_of(name: str, inputs: LeafSystem, outputs: LeafSystem, groups: Groups) -> Diagram:
-    """The station as a Diagram: one system has the contract's input ports under their names, one the output ports."""
+def station_of(
+    name: str,
+    inputs: LeafSystem,
+    outputs: LeafSystem,
+    groups: Groups,
+    computed: Callable[[DiagramBuilder, Mapping[str, OutputPort]], Mapping[str, OutputPort]] = lambda *_: {},
+) -> Diagram:
+    """The station as a Diagram: one system has the contract's input ports under their names, one the output ports.
+
+    computed: adds what makes some output ports of the others -> these.
+    """
     builder = DiagramBuilder()
     for system in {id(system): system for system in (outputs, inputs)}.values():
         builder.AddSystem(system)
+    ports = {spec.name: outputs.GetOutputPort(spec.name) for spec in CONTRACT if spec.direction == "out"}
+    ports |= computed(builder, ports)
     for spec in CONTRACT:
         if spec.direction == "in":
             builder.ExportInput(inputs.GetInputPort(spec.name), spec.name)
         else:
-            builder.ExportOutput(outputs.GetOutputPort(spec.name), spec.name)
+            builder.ExportOutput(ports[spec.name], spec.name)
     station = builder.Build()
     station.set_name(name)
     check_contract(station, groups)

@@ -36,9 +36,10 @@ from valve_drake.console import complain
 from valve_drake.messages import SIDES, CameraFrame, Health
 from valve_drake.ports import SLOT, TICK, PythonSystem
 from valve_drake.robot.groups import GROUPS, Groups
+from valve_drake.robot.robot import Robot
 from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rig import decode_image
-from valve_drake.stations.contract import CAMERAS, CONTRACT, HEAD, station_of, vectors
+from valve_drake.stations.contract import CAMERAS, CONTRACT, HEAD, SAID_BY, station_of, vectors
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
@@ -57,11 +58,13 @@ from valve_drake.stations.lcm_channels import (
     WrongMessage,
     check_sizes,
     from_utime,
+    present,
     read_image,
     read_named,
     to_utime,
 )
 from valve_drake.stations.reports import BadMessages, LeastDelay, Lockstep, Stamps, listed
+from valve_drake.stations.torque_wrench import add_torque_wrenches
 
 NEVER_STILL = tuple(row.key for row in REPORTS if row.device.endswith("wrist_sensor"))
 SPEEDS = ("base.odometry", *(f"{side}_arm.velocity_measured" for side in SIDES))  # ports that tell of motion
@@ -155,6 +158,9 @@ class RobotLink:
         self.bus = bus
         self.groups = groups
         self._sizes = vectors(groups)
+        self._silent = [SAID_BY[device] for device in groups.absent]
+        self._said, self._told = present(REPORTS, groups), present(COMMANDS, groups)
+        self._devices = tuple(device for device in DEVICES if device not in groups.absent)
         self.stop = stop
         self._config = bus.config
         self._idle = idle or (lambda: wall.sleep(2e-4))
@@ -266,7 +272,7 @@ class RobotLink:
         Raises OperationFailed if the robot does not answer or another program is there, ConfigError if it is not the
         robot of this program.
         """
-        needed = [row.key for row in REPORTS] + [STATE]
+        needed = [row.key for row in self._said] + [STATE]
         alone = self.bus.claim(CONTROLLER)
 
         def ready() -> bool:
@@ -360,8 +366,8 @@ class RobotLink:
     def _look(self) -> Snapshot:
         now, time = self.clock(), self._time
         self._delay.close(time)
-        values: Values = {}
-        for row in REPORTS:
+        values: Values = {name: np.zeros(self._sizes[name]) for name in self._silent}
+        for row in self._said:
             report = self._reports[row.key]
             silent = row.key in NEVER_STILL and not now - report.arrival <= self._config.report_age
             values |= {port: np.full_like(v, np.nan) for port, v in report.values.items()} if silent else report.values
@@ -371,7 +377,7 @@ class RobotLink:
         return Snapshot(values, self._shown(time), self._health)
 
     def _diagnose(self, now: float, time: float) -> Health:
-        ages = [now - self._reports[row.key].arrival for row in REPORTS]
+        ages = [now - self._reports[row.key].arrival for row in self._said]
         for camera, row in IMAGES.items():
             since = self._requests.since.get(camera)
             last = self._reports[row.key].arrival if row.key in self._reports else -math.inf
@@ -383,7 +389,11 @@ class RobotLink:
         faults += ["another program commands this robot"] if self.bus.others(CONTROLLER) else []
         faults += ["two robots on the bus"] if self.bus.others(ROBOT) > 1 else []
         return Health(
-            time=time, devices=DEVICES, ages=np.array(ages), faults=tuple(faults), estop=bool(state.get("estop", 1))
+            time=time,
+            devices=self._devices,
+            ages=np.array(ages),
+            faults=tuple(faults),
+            estop=bool(state.get("estop", 1)),
         )
 
     def _shown(self, time: float) -> dict[str, _Image | None]:
@@ -431,7 +441,7 @@ class RobotLink:
     def send(self, time: float, commands: Values) -> None:
         """Publishes the commands of the tick that began at `time`."""
         stamp = to_utime(time)
-        for row in COMMANDS:
+        for row in self._told:
             self.bus.send(row.key, row.encode(stamp, commands))
         changed = self._requests.update(time, self.clock())
         if changed or round(time / TICK) % round(self._config.request_period / TICK) == 0:
@@ -551,6 +561,7 @@ class LcmSender(PythonSystem):
         self._link.send(context.get_time() - 3 * SLOT, values)
 
 
-def make_hardware_station(link: RobotLink) -> Diagram:
-    """The station as a Diagram named `hardware`."""
-    return station_of("hardware", inputs=LcmSender(link), outputs=LcmReceiver(link), groups=link.groups)
+def make_hardware_station(link: RobotLink, robot: Robot | None = None) -> Diagram:
+    """The station as a Diagram named `hardware`. robot: at the other end; needed for one without force sensors."""
+    computed = functools.partial(add_torque_wrenches, robot)
+    return station_of("hardware", LcmSender(link), LcmReceiver(link), link.groups, computed)

@@ -30,6 +30,8 @@ from valve_drake.config import Config, number, numbers, plain, texts
 from valve_drake.messages import POSE_HISTORY, SIDES, CameraFrame, Mode
 from valve_drake.ports import SLOT, TICK
 from valve_drake.processor import HIGHEST
+from valve_drake.robot.drive import SPEEDS
+from valve_drake.robot.groups import POSE, Groups
 from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.network import LOOPBACK, NAME, group_of
 
@@ -90,7 +92,8 @@ def check_sizes(values: Values, sizes: Mapping[str, int]) -> Values:
     """The values of a message, whose vectors have the robot's sizes (contract.vectors). Raises WrongMessage."""
     for port, value in values.items():
         if len(value) != sizes[port]:
-            raise WrongMessage(f"{len(value)} joints, want {sizes[port]}")
+            what = "values" if port.startswith("base.") else "joints"
+            raise WrongMessage(f"{len(value)} {what}, want {sizes[port]}")
     return values
 
 
@@ -99,12 +102,15 @@ def _count(wanted: int, found: int, what: str) -> None:
         raise WrongMessage(f"{found} {what}, want {wanted}")
 
 
-def _signal(port: str, coordinates: tuple[str, ...]) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _base(port: str, before: tuple[str, ...] = ()) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """A vector of `before` and the speeds that the base has, by their names."""
+    names = {len(names): names for names in ((*before, *speeds) for speeds in SPEEDS.values())}
+
     def write(values: Values) -> lcmt_drake_signal:
-        return signal(dict(zip(coordinates, values[port].tolist())))
+        vector = values[port].tolist()
+        return signal(dict(zip(names[len(vector)], vector)))
 
     def read(message: lcmt_drake_signal) -> Values:
-        _count(len(coordinates), message.dim, "values")
         return {port: np.array(message.val)}
 
     return write, read
@@ -186,11 +192,11 @@ _UNUSED = "the other fields are not read"
 
 def _rows() -> Iterable[Channel]:
     """Commands, reports, cameras, then what keeps the two sides together."""
-    twist, odometry = ("forward", "yaw_rate"), ("x", "y", "heading", "forward", "yaw_rate")
+    twist = "yaw_rate [rad/s, counter-clockwise from above]; a holonomic base has sideways [m/s, to the left] before it"
     yield Channel(
         "base.command", CONTROLLER, lcmt_drake_signal, TICKS,
-        "forward [m/s], yaw_rate [rad/s, counter-clockwise from above]",
-        *_signal("base.twist_command", twist), stamp="timestamp",
+        f"forward [m/s], {twist}",
+        *_base("base.twist_command"), stamp="timestamp",
     )  # fmt: skip
     joints = "joint_position [rad]; num_torques 0"
     turns = "waist and pan to the left, tilt downwards"
@@ -215,8 +221,8 @@ def _rows() -> Iterable[Channel]:
         )  # fmt: skip
     yield Channel(
         "base.status", ROBOT, lcmt_drake_signal, TICKS,
-        "x, y [m], heading [rad], in the frame where odometry began; forward [m/s], yaw_rate [rad/s]",
-        *_signal("base.odometry", odometry), stamp="timestamp",
+        "x, y [m], heading [rad], in the frame where odometry began; forward [m/s], (sideways [m/s],) yaw_rate [rad/s]",
+        *_base("base.odometry", POSE), stamp="timestamp",
     )  # fmt: skip
     yield Channel(
         "torso.status", ROBOT, lcmt_iiwa_status, TICKS,
@@ -304,6 +310,11 @@ COMMANDS = tuple(row for row in CHANNELS.values() if row.sender == CONTROLLER an
 REPORTS = tuple(row for row in CHANNELS.values() if row.sender == ROBOT and row.write)
 IMAGES = {camera: CHANNELS[f"{camera}.image"] for camera in CAMERAS}
 DEVICES = (*(row.device for row in REPORTS), *CAMERAS, "robot")
+
+
+def present(rows: Iterable[Channel], groups: Groups) -> tuple[Channel, ...]:
+    """Those of the devices that a robot has: a fixed base and a hand without a force sensor say and hear nothing."""
+    return tuple(row for row in rows if row.device not in groups.absent)
 
 
 def table() -> str:

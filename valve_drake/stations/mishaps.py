@@ -63,17 +63,21 @@ def slips(mishap: MishapConfig, time: float) -> float:
 
 
 class WheelSlipSystem(PythonSystem):
-    """A base that does not go where its wheels turn. Ports: twist (2,) in, commanded; twist_command (2,) out, done."""
+    """A base that does not go where its wheels turn.
 
-    def __init__(self, mishap: MishapConfig):
+    Ports: twist (count,) in, commanded; twist_command (count,) out, done.
+    """
+
+    def __init__(self, mishap: MishapConfig, count: int):
+        """count: of the speeds that the base has."""
         super().__init__()
         self.set_name("wheel_slip")
-        twist = self.DeclareVectorInputPort("twist", 2)
+        twist = self.DeclareVectorInputPort("twist", count)
 
         def calc(context: Context, output: BasicVector) -> None:
             output.SetFromVector((1.0 - slips(mishap, context.get_time())) * twist.Eval(context))
 
-        self.DeclareVectorOutputPort("twist_command", 2, calc)
+        self.DeclareVectorOutputPort("twist_command", count, calc)
 
 
 class InterruptingOperator:

@@ -11,7 +11,7 @@ import contextlib
 import itertools
 import math
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from pydrake.common.value import Value
@@ -30,6 +30,7 @@ from valve_drake import profiling
 from valve_drake.beside import Beside
 from valve_drake.messages import SIDES
 from valve_drake.ports import SLOT, TICK, PythonSystem
+from valve_drake.robot.drive import whole
 from valve_drake.robot.groups import GROUPS
 from valve_drake.robot.robot import Robot
 from valve_drake.stations import contacts
@@ -45,6 +46,7 @@ STEM = "stem"  # the valve's joint, and the output port of its load
 
 
 _Pose = tuple[float, float, float]  # x, y, heading [m, rad]
+_Twist = tuple[float, float, float]  # forward, sideways, yaw rate [m/s, rad/s]
 
 
 class PlantSystem(PythonSystem):
@@ -55,10 +57,11 @@ class PlantSystem(PythonSystem):
     (the station's inputs)           in   vector     as in stations/contract.py
     now                              out  vector     all of the state, in parts: `parts` has the slice of each
       of it: state                        vector     positions and velocities of `plant`
-      base                                vector(3)  the base's set point x, y, heading [m, rad]
+      base                                vector(3)  the base's set point x, y, heading, or where it is bolted [m, rad]
       actuation                           vector     of the robot's actuators in the last step, by index [N m, N]
       left, right, stem                   vector(6)  [torque; force] of the joint on its child in the last step, in
-                                                     the child's frame: the wrist sensors and the valve's stem
+                                                     the child's frame: the wrist sensors, of hands that have one,
+                                                     and the valve's stem
       left_opening, right_opening         vector(1)  between the pads [m]
       left_grip, right_grip               vector(1)  force of the finger actuator that closes, in the last step [N]
     contacts                         out  Contacts   what touched what in the last step, a look every 1/16 s
@@ -89,9 +92,11 @@ class PlantSystem(PythonSystem):
         start: Mapping[str, float],
         offsets: Mapping[str, np.ndarray],
         robot: Robot,
+        place: Sequence[float] = (0.0, 0.0, 0.0),
     ):
         """start: joint of the robot -> where it is at first [m, rad]; offsets: side -> what the arm's encoders read at
-        the joints' true zero (n,) [rad]: an arm goes to where its encoders read the command."""
+        the joints' true zero (n,) [rad]: an arm goes to where its encoders read the command. place: of a fixed base,
+        x, y, heading."""
         super().__init__()
         self.set_name("plant")
         builder = DiagramBuilder()
@@ -105,7 +110,7 @@ class PlantSystem(PythonSystem):
         self.plant, self.scene_graph = AddMultibodyPlant(config, builder)
         self.plant.set_name("plant")
         self.scene_graph.set_name("scene_graph")
-        scene = add_scene(self.plant, valve, shape, robot.description)
+        scene = add_scene(self.plant, valve, shape, robot.description, place)
         self.robot, self.valve = scene.robot, scene.valve
         add_servos(self.plant, self.robot, robot)
         self.plant.Finalize()
@@ -130,7 +135,7 @@ class PlantSystem(PythonSystem):
         fingers = [robot.grippers[side].joint for side in SIDES]
         self._sent = [order.index(j) for names in map(robot.groups.names, GROUPS) for j in names]
         self._zeros = np.concatenate([np.zeros(len(robot.torso)), *(offsets[side] for side in SIDES)])
-        self.base = robot.base.names
+        self.base, self.place = robot.base.names, tuple(place)
         self._base_at = [order.index(name) for name in self.base]
         self._fingers = [(order.index(name), joints[order.index(name)].position_start()) for name in fingers]
         self._actuated_at = [joint.velocity_start() for joint in joints]
@@ -151,11 +156,12 @@ class PlantSystem(PythonSystem):
         self._reaction_forces = self.plant.get_reaction_forces_output_port()
         self._contact_results = self.plant.get_contact_results_output_port()
         self._reader = contacts.ContactReader(self.plant, self.robot, self.valve, robot)
-        loaded = {side: robot.description.arm(side).sensor for side in SIDES} | {STEM: STEM}  # output port -> joint
+        sensed = {side: robot.description.arm(side).sensor for side in SIDES if not robot.feels_by_torque(side)}
+        loaded = sensed | {STEM: STEM}  # output port -> joint
         present = list(self.plant.GetJointIndices())  # a welded joint has left its index unused
         self._loads = [present.index(self.plant.GetJointByName(name).index()) for name in loaded.values()]
         x = self.plant.GetPositionsAndVelocities(self._inner)
-        base = [start[name] for name in self.base]
+        base = [start[name] for name in self.base] or list(place)
         grips = [f"{side}_{what}" for side in SIDES for what in ("opening", "grip")]
         counts = {"state": len(x), "base": len(base), "actuation": len(joints)}
         counts |= {**dict.fromkeys(loaded, 6), **dict.fromkeys(grips, 1)}
@@ -187,7 +193,7 @@ class PlantSystem(PythonSystem):
         self.plant.SetPositionsAndVelocities(plant_context, x)
         commands, desired = self._commands(context), np.zeros(len(self._desired))
         self._set_joints(desired, commands)
-        self._set_base(desired, tuple(base.tolist()), tuple(commands["base.twist_command"].tolist()), 0.0)
+        self._set_base(desired, tuple(base.tolist()), whole(commands["base.twist_command"]), 0.0)
         self._set_fingers(desired, x, self._grips(x, commands))
         self.diagram.GetInputPort("desired").FixValue(inner, desired)
         self.diagram.GetInputPort("feed_forward").FixValue(inner, self._gravity(plant_context))
@@ -230,12 +236,12 @@ class PlantSystem(PythonSystem):
         sent = [commands["torso.position_command"], *(commands[f"{side}_arm.position_command"] for side in SIDES)]
         desired[self._sent] = np.concatenate(sent) - self._zeros
 
-    def _set_base(self, desired: np.ndarray, base: _Pose, twist: tuple[float, float], time: float) -> None:
+    def _set_base(self, desired: np.ndarray, base: _Pose, twist: _Twist, time: float) -> None:
         """The base in `desired`, `time` after the tick's begin; base: its set point then."""
-        forward, yaw_rate = twist
+        forward, sideways, yaw_rate = twist
         pose = _driven(base, twist, time)
-        heading = pose[2]
-        speed = (forward * math.cos(heading), forward * math.sin(heading), yaw_rate)
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        speed = (forward * c - sideways * s, forward * s + sideways * c, yaw_rate)
         n = len(self.actuated)
         for at, q, v in zip(self._base_at, pose, speed):
             desired[at], desired[n + at] = q, v
@@ -300,7 +306,7 @@ class PlantSystem(PythonSystem):
     ) -> tuple[np.ndarray, ...]:
         scratch, desired = self._scratch, self._desired
         start: _Pose = tuple(base.tolist())
-        twist: tuple[float, float] = tuple(commands["base.twist_command"].tolist())
+        twist = whole(commands["base.twist_command"])
         grips = self._grips(x, commands)
         scratch.SetDiscreteState(x)
         self._set_friction(x)
@@ -332,13 +338,13 @@ def _made(context: Context) -> int:
     return (round(context.get_time() / SLOT) + 1) // round(TICK / SLOT) + 1
 
 
-def _driven(base: _Pose, twist: tuple[float, float], time: float) -> _Pose:
+def _driven(base: _Pose, twist: _Twist, time: float) -> _Pose:
     """Where x, y, heading are after driving straight on or on an arc."""
     x, y, heading = base
-    forward, yaw_rate = twist
+    forward, sideways, yaw_rate = twist
     middle = heading + yaw_rate * time / 2
-    way = forward * time
-    return x + way * math.cos(middle), y + way * math.sin(middle), heading + yaw_rate * time
+    c, s, way, aside = math.cos(middle), math.sin(middle), forward * time, sideways * time
+    return x + (way * c - aside * s), y + (way * s + aside * c), heading + yaw_rate * time
 
 
 def _leave_out_looks(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:

@@ -33,9 +33,12 @@ def parse(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
     return model.parse(plant, resources.models() / name / f"{name}.sdf")
 
 
-def add_robot(plant: MultibodyPlant, robot: RobotDescription | None) -> ModelInstanceIndex:
-    """Adds the robot; None: our own."""
-    return model.add_robot(plant, description.load(description.find(description.OURS)) if robot is None else robot)
+def add_robot(
+    plant: MultibodyPlant, robot: RobotDescription | None, place: Sequence[float] = (0.0, 0.0, 0.0)
+) -> ModelInstanceIndex:
+    """Adds the robot; None: our own. place: of a fixed base, x, y, heading in W."""
+    given = description.load(description.find(description.OURS)) if robot is None else robot
+    return model.add_robot(plant, given, place)
 
 
 def panel_pose(valve: ValveConfig) -> np.ndarray:
@@ -66,11 +69,15 @@ def add_scene(
     valve: ValveConfig,
     shape: Valve,
     robot: RobotDescription | None = None,
+    place: Sequence[float] = (0.0, 0.0, 0.0),
     *,
     laboratory: bool = True,
 ) -> Scene:
-    """Adds everything to a plant that is not finalized. The valve's limits and friction are those of the config."""
-    robot_model = add_robot(plant, robot)
+    """Adds everything to a plant that is not finalized. The valve's limits and friction are those of the config.
+
+    place: where a fixed base is bolted down, x, y, heading in W; others are put there by their joints.
+    """
+    robot_model = add_robot(plant, robot, place)
     valve_model = add_valve(plant, shape, _marker_offset(valve, shape.marker.size))
     X_WP = panel_pose(valve)
     plant.WeldFrames(  # mounts the panel in the room

@@ -14,14 +14,22 @@ from pydrake.common.value import Value
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, InputPort, OutputPort
-from pydrake.systems.primitives import AffineSystem, ConstantValueSource, Demultiplexer, MatrixGain
+from pydrake.systems.primitives import (
+    AffineSystem,
+    ConstantValueSource,
+    ConstantVectorSource,
+    Demultiplexer,
+    MatrixGain,
+)
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
 from valve_drake.messages import DEVICES, LEFT, SIDES, CameraFrame, Health
 from valve_drake.ports import TICK, Block, Inputs, Outputs, PythonSystem
-from valve_drake.robot.description import RobotDescription
+from valve_drake.robot.description import ArmDescription, RobotDescription
+from valve_drake.robot.drive import DIFFERENTIAL, Drive, whole
+from valve_drake.robot.groups import POSE
 from valve_drake.robot.robot import Robot
 from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
 from valve_drake.stations.camera_workers import CameraWorkers
@@ -30,6 +38,7 @@ from valve_drake.stations.mishaps import LostGripSystem, WheelSlipSystem, slips
 from valve_drake.stations.plant_system import COMMANDS, STEM, PlantSystem
 from valve_drake.stations.scene import add_scene, panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, MishapConfig, SimulationConfig, ValveConfig
+from valve_drake.stations.torque_wrench import add_torque_wrenches
 from valve_drake.valve.model import marker_frame
 from valve_drake.valve.valve import Valve
 
@@ -66,34 +75,36 @@ class OdometrySystem(Block[OdometryInputs, tuple[np.ndarray, int]]):
     port      dir  type       unit                notes
     --------  ---  ---------  ------------------  ------------------------------------
     base      in   vector(6)  m, rad, m/s, rad/s  x, y, heading and their rates, true
-    odometry  out  vector(5)  m, rad, m/s, rad/s  x, y, heading, forward, yaw rate
+    odometry  out  vector     m, rad, m/s, rad/s  x, y, heading, and the speeds that the base has
     """
 
-    OUTPUTS = {"odometry": 5}
-
-    def __init__(self, error: ErrorConfig, seed: int, mishap: MishapConfig | None = None):
-        self._error, self._mishap = error, mishap or MishapConfig()
-        self._noise = _Noise(seed, 1, 2)
-        self._scale = (1 + error.odometry_scale * _rng(seed, 0).standard_normal(2)).tolist()
+    def __init__(self, error: ErrorConfig, seed: int, mishap: MishapConfig | None = None, drive: Drive = DIFFERENTIAL):
+        self._error, self._mishap, self._drive = error, mishap or MishapConfig(), drive
+        count = len(drive.names)
+        self._noise = _Noise(seed, 1, count)
+        self._scale = (1 + error.odometry_scale * _rng(seed, 0).standard_normal(count)).tolist()
+        self.OUTPUTS = {"odometry": len(POSE) + count}
         super().__init__("odometry", slot=3)
 
     def initial(self) -> tuple[np.ndarray, int]:
-        return np.zeros(5), 0
+        return np.zeros(len(POSE) + len(self._drive.names)), 0
 
     def step(
         self, time: float, inputs: OdometryInputs, memory: tuple[np.ndarray, int]
     ) -> tuple[tuple[np.ndarray, int], Outputs]:
         last, count = memory
-        x, y, h, _, _ = last.tolist()
+        x, y, h = last.tolist()[: len(POSE)]
         _, _, heading, vx, vy, w = inputs.base.tolist()
-        forward = vx * math.cos(heading) + vy * math.sin(heading)
+        c, s = math.cos(heading), math.sin(heading)
         turning = 1.0 - slips(self._mishap, time)  # of the wheels' way, what the base has made
-        forward, w = (forward / turning, w / turning) if turning > 0 else (0.0, 0.0)
+        made = (vx * c + vy * s, vy * c - vx * s, w)
+        true = self._drive.part(np.array([speed / turning if turning > 0 else 0.0 for speed in made])).tolist()
         draw, noise = self._noise(count).tolist(), self._error.odometry_noise
-        forward = forward * self._scale[0] * (1 + noise * draw[0])
-        w = w * self._scale[1] * (1 + noise * draw[1])
-        middle, way = h + w * TICK / 2, forward * TICK
-        new = np.array([x + way * math.cos(middle), y + way * math.sin(middle), h + w * TICK, forward, w])
+        twist = [speed * scale * (1 + noise * off) for speed, scale, off in zip(true, self._scale, draw)]
+        forward, sideways, w = whole(np.array(twist))
+        middle, way, aside = h + w * TICK / 2, forward * TICK, sideways * TICK
+        c, s = math.cos(middle), math.sin(middle)
+        new = np.array([x + (way * c - aside * s), y + (way * s + aside * c), h + w * TICK, *twist])
         return (new, count + 1), {"odometry": new}
 
 
@@ -104,12 +115,13 @@ class WrenchSensorSystem(Block[Inputs, int]):
     ----------------------  ---  ---------  --------------------------------------------------------
     left_load, right_load   in   vector(6)  on the hand, from the arm, [torque; force] [N m, N]
     left, right             out  vector(6)  what the sensor feels, the opposite [torque; force] [N m, N]
+
+    sides: of the hands that have one.
     """
 
-    INPUTS = {f"{side}_load": 6 for side in SIDES}
-    OUTPUTS = {side: 6 for side in SIDES}
-
-    def __init__(self, error: ErrorConfig, seed: int):
+    def __init__(self, error: ErrorConfig, seed: int, sides: Sequence[str] = SIDES):
+        self.INPUTS = {f"{side}_load": 6 for side in sides}
+        self.OUTPUTS = {side: 6 for side in sides}
         self._noise = _Noise(seed, 3, 12)
         torque, force = np.ones(3), np.ones(3)
         self._scatter = np.concatenate([error.wrench_noise_torque * torque, error.wrench_noise_force * force])
@@ -125,8 +137,33 @@ class WrenchSensorSystem(Block[Inputs, int]):
         draw = self._noise(memory).reshape(2, 6)
         out = {}
         for k, side in enumerate(SIDES):
+            if side not in self.OUTPUTS:
+                continue
             out[side] = -inputs[f"{side}_load"] + self._bias[side] + self._scatter * draw[k]
         return memory + 1, out
+
+
+class TorqueSensorSystem(Block[Inputs, int]):
+    """The torque readings of an arm that has no force sensor, with the bias and noise that robot.yaml states.
+
+    port    dir  type    notes
+    ------  ---  ------  ---------------------------------------
+    true    in   vector  of the joints' actuators [N m]
+    torque  out  vector  what they read [N m]
+    """
+
+    def __init__(self, side: str, arm: ArmDescription, seed: int):
+        count, stream = len(arm.joints), 6 + 2 * SIDES.index(side)
+        self.INPUTS, self.OUTPUTS = {"true": count}, {"torque": count}
+        self._scatter, self._noise = np.array(arm.torque_noise), _Noise(seed, stream, count)
+        self._bias = np.array(arm.torque_bias or [0.0] * count) * _rng(seed, stream + 1).standard_normal(count)
+        super().__init__(f"{side}_torque_sensor", slot=3)
+
+    def initial(self) -> int:
+        return 0
+
+    def step(self, time: float, inputs: Inputs, memory: int) -> tuple[int, Outputs]:
+        return memory + 1, {"torque": inputs["true"] + self._bias + self._scatter * self._noise(memory)}
 
 
 class HealthSystem(Block[Inputs, None]):
@@ -167,6 +204,7 @@ class TruthSystem(PythonSystem):
         stem = plant.GetJointByName("stem", physics.valve)
         self._q, self._v = stem.position_start(), plant.num_positions() + stem.velocity_start()
         self._base = [plant.GetJointByName(j, physics.robot).position_start() for j in physics.base]
+        self._place = physics.place
         self._bar_angle = valve.bar_angle
         self._X_WP = panel_pose(valve)
         marker = marker_frame(plant, physics.valve)
@@ -183,7 +221,7 @@ class TruthSystem(PythonSystem):
         output.SetFromVector([state[self._q] - self._bar_angle, state[self._v]])
 
     def _calc_base_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._state.Eval(context)[self._base])
+        output.SetFromVector(self._state.Eval(context)[self._base] if self._base else self._place)
 
     def _calc_marker_pose(self, context: Context, output: BasicVector) -> None:
         angle = self._state.Eval(context)[self._q] if self._turns else 0.0
@@ -233,10 +271,11 @@ def rig_arguments(
     head: StereoHead,
     seed: int,
     robot: RobotDescription,
+    place: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> tuple[Any, ...]:
-    """The arguments of CameraRig, or of CameraWorkers, for the station's cameras."""
+    """The arguments of CameraRig, or of CameraWorkers, for the station's cameras. place: of a fixed base."""
     mounts = make_mounts(head, simulation, seed, robot.cameras)
-    return mounts, simulation.valve, shape, simulation.light, simulation.camera, seed, robot
+    return mounts, simulation.valve, shape, simulation.light, simulation.camera, seed, robot, place
 
 
 POSITIONS, BASE = "positions", "base"  # of the plant; of the base, with their rates: what the station measures inside
@@ -306,7 +345,7 @@ def make_plant(
         start = RobotStart(start_pose(simulation.start, valve), robot.torso.home, home)
     arms = {side: q - offsets[side] for side, q in start.arms.items()}  # the start is what the encoders read
     at_start = robot.named(base=start.base, torso=start.torso, arms=arms, opening=robot.opening)
-    return PlantSystem(valve, shape, at_start, offsets, robot)
+    return PlantSystem(valve, shape, at_start, offsets, robot, start.base.tolist())
 
 
 def _mishaps(
@@ -325,8 +364,8 @@ def _mishaps(
             name = f"{mishap.grip_lost_hand}_gripper.{command}"
             builder.Connect(lost.GetOutputPort(command), physics.GetInputPort(name))
             out[name] = lost.GetInputPort(port)
-    if mishap.wheel_slip_at >= 0:
-        slip = builder.AddSystem(WheelSlipSystem(mishap))
+    if mishap.wheel_slip_at >= 0 and not robot.drive.fixed:
+        slip = builder.AddSystem(WheelSlipSystem(mishap, len(robot.drive.names)))
         builder.Connect(slip.GetOutputPort("twist_command"), physics.GetInputPort("base.twist_command"))
         out["base.twist_command"] = slip.GetInputPort("twist")
     return out
@@ -358,9 +397,11 @@ def make_simulated_station(
         builder.ExportInput(done.get(name, physics.GetInputPort(name)), name)
     measured: dict[str, tuple[np.ndarray, np.ndarray | float]] = {
         POSITIONS: (np.eye(plant.num_positions(), physics.size), 0.0),
-        BASE: (np.vstack([_select(physics, robot.base.names, what) for what in ("position", "velocity")]), 0.0),
         "torso.position_measured": (_select(physics, robot.torso.names, "position"), 0.0),
     }
+    if not robot.drive.fixed:
+        rows = [_select(physics, robot.base.names, what) for what in ("position", "velocity")]
+        measured[BASE] = np.vstack(rows), 0.0
     for side in SIDES:
         joints = robot.arms[side].names
         measured[f"{side}_arm.position_measured"] = _select(physics, joints, "position"), offsets[side]
@@ -369,20 +410,36 @@ def make_simulated_station(
         builder.ExportOutput(part[f"{side}_opening"], f"{side}_gripper.position_measured")
         builder.ExportOutput(part[f"{side}_grip"], f"{side}_gripper.force_measured")
     ports = _measured(builder, now, measured)
+    without = [side for side in SIDES if robot.feels_by_torque(side)]
+    for side in without:
+        name = f"{side}_arm.torque_measured"
+        sensors = builder.AddSystem(TorqueSensorSystem(side, robot.description.arm(side), seed))
+        builder.Connect(ports[name], sensors.GetInputPort("true"))
+        ports[name] = sensors.GetOutputPort("torque")
     for name in measured.keys() - {POSITIONS, BASE}:
         builder.ExportOutput(ports[name], name)
 
-    odometry = builder.AddSystem(OdometrySystem(simulation.error, seed, simulation.mishap))
-    builder.Connect(ports[BASE], odometry.GetInputPort("base"))
-    builder.ExportOutput(odometry.GetOutputPort("odometry"), "base.odometry")
+    if robot.drive.fixed:
+        still = builder.AddNamedSystem("odometry", ConstantVectorSource(np.zeros(len(POSE))))
+        builder.ExportOutput(still.get_output_port(), "base.odometry")
+    else:
+        odometry = builder.AddSystem(OdometrySystem(simulation.error, seed, simulation.mishap, robot.drive))
+        builder.Connect(ports[BASE], odometry.GetInputPort("base"))
+        builder.ExportOutput(odometry.GetOutputPort("odometry"), "base.odometry")
 
-    wrench = builder.AddSystem(WrenchSensorSystem(simulation.error, seed))
-    for side in SIDES:
-        builder.Connect(part[side], wrench.GetInputPort(f"{side}_load"))
-        builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
+    if with_sensor := [side for side in SIDES if side not in without]:
+        wrench = builder.AddSystem(WrenchSensorSystem(simulation.error, seed, with_sensor))
+        for side in with_sensor:
+            builder.Connect(part[side], wrench.GetInputPort(f"{side}_load"))
+            builder.ExportOutput(wrench.GetOutputPort(side), f"{side}_wrist.wrench")
+    for name, port in add_torque_wrenches(robot, builder, ports).items():
+        builder.ExportOutput(port, name)
 
     camera = simulation.camera
-    images = CameraRig(*rig_arguments(simulation, shape, head, seed, robot.description)) if workers is None else workers
+    place = physics.place
+    images: Any = workers
+    if images is None:
+        images = CameraRig(*rig_arguments(simulation, shape, head, seed, robot.description, place))
     missing = [name for name in WRISTS if not robot.description.cameras[name]]
     for name in missing:  # its port never shows an image
         nothing = builder.AddNamedSystem(name, ConstantValueSource(Value(CameraFrame(camera=name))))
@@ -393,7 +450,7 @@ def make_simulated_station(
         builder.Connect(ports[POSITIONS], system.GetInputPort("positions"))
         builder.ExportOutput(system.GetOutputPort("image"), f"{name}.image")
 
-    health = builder.AddSystem(HealthSystem(missing))
+    health = builder.AddSystem(HealthSystem([*missing, *robot.groups.absent]))
     builder.ExportOutput(health.GetOutputPort("health"), "health")
 
     truth = builder.AddSystem(TruthSystem(physics, valve))
@@ -404,7 +461,7 @@ def make_simulated_station(
     builder.ExportOutput(physics.GetOutputPort("contacts"), TRUTH + "contacts")
 
     if meshcat is not None:
-        view = _add_view(builder, ports[POSITIONS], valve, shape, meshcat, robot.description)
+        view = _add_view(builder, ports[POSITIONS], valve, shape, meshcat, robot.description, place)
         physics.view = view  # lives as long
     station = builder.Build()
     station.set_name("simulated")
@@ -419,12 +476,13 @@ def _add_view(
     shape: Valve,
     meshcat: Meshcat,
     robot: RobotDescription | None,
+    place: Sequence[float],
 ) -> MultibodyPlant:
     """Shows the positions in a scene of its own, with all looks -> its plant, which must outlive the diagram."""
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
-    add_scene(plant, valve, shape, robot)
+    add_scene(plant, valve, shape, robot, place)
     plant.Finalize()
     poses = builder.AddNamedSystem("poses", MultibodyPositionToGeometryPose(plant))
     builder.Connect(positions, poses.get_input_port())

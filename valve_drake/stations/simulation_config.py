@@ -43,7 +43,7 @@ class StartConfig(Config):
     """Where the robot starts."""
 
     KEY = "simulation.start"
-    distance: Number = number(3.0, 0.9, 8.0, "base to valve, along the floor [m]")
+    distance: Number = number(3.0, 0.4, 8.0, "base to valve, along the floor [m]")
     bearing: Number = number(0.0, -1.4, 1.4, "of the robot, seen from the valve, off the panel's normal [rad]")
     heading: Number = number(0.0, -math.pi, math.pi, "of the robot, off the direction to the valve [rad]")
     at_valve: bool = plain(False, "instead: where the hands reach, both on the handles, as a lesson of `teach` begins")

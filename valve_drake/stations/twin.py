@@ -31,6 +31,7 @@ from valve_drake.messages import CameraFrame
 from valve_drake.motion import slew
 from valve_drake.ports import SLOT, TICK
 from valve_drake.processor import YIELDING, hurries
+from valve_drake.robot.drive import whole
 from valve_drake.robot.groups import GROUPS
 from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rate import SECOND, CameraRate
@@ -68,7 +69,7 @@ VECTORS = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and no
 FAULT_TIME = 0.5  # a refused command is reported as a fault for this long [s]
 REQUEST_AGE = 0.5  # cameras stop when the last request for them is older [s]
 FAR = 0.5  # a joint command farther from the measured position is refused [rad]
-FAST = (2.0, 3.0)  # a faster base twist is refused [m/s, rad/s]
+FAST = (2.0, 2.0, 3.0)  # a base twist (forward, sideways, yaw rate) that is faster is refused [m/s, rad/s]
 GRIP = (0.2, 200.0)  # a larger opening or force is refused [m, N]
 FASTER = 1.25  # the robot's own limit on its joints' speed, as a multiple of what its description grants the program
 BEHIND = 0.1  # a joint whose limited motion is farther behind its command is reported [rad]
@@ -179,6 +180,7 @@ class Guard:
         """start: port -> vector: what holds until the first command. age: of commands [s]. speed: of a group's joints,
         at most [1/s]."""
         self._speed = speed
+        self._rows = [row for row in COMMANDS if row.device != "base" or len(start["base.twist_command"])]
         self._commanded = dict(start)
         self._targets = dict(start)  # what the joints were told last
         self._behind: set[str] = set()  # channels whose command is farther ahead than the joints' speed allows
@@ -208,12 +210,13 @@ class Guard:
         A joint that was stopped goes slowly to where it is commanded afterwards, however far that is by then.
         """
         targets = dict(self._commanded)
-        for row in COMMANDS:
+        for row in self._rows:
             if row.device.endswith("gripper"):
                 continue
             stop = estop or self._late(row.key, time)
             if row.device == "base":
-                targets["base.twist_command"] = np.zeros(2) if stop else self._commanded["base.twist_command"]
+                twist = self._commanded["base.twist_command"]
+                targets["base.twist_command"] = np.zeros_like(twist) if stop else twist
                 continue
             port = f"{row.device}.position_"
             goal, stopped = self._commanded[port + "command"], row.key in self._stopped
@@ -232,8 +235,8 @@ class Guard:
 
     def faults(self, time: float) -> list[str]:
         """Faults of the commands, one line each."""
-        words = [f"{row.key} late" for row in COMMANDS if self._late(row.key, time)]
-        words += [f"{row.key} faster than the joints may move" for row in COMMANDS if row.key in self._behind]
+        words = [f"{row.key} late" for row in self._rows if self._late(row.key, time)]
+        words += [f"{row.key} faster than the joints may move" for row in self._rows if row.key in self._behind]
         return words + [f"{key} refused: {p}" for key, (p, when) in self._refused.items() if time - when <= FAULT_TIME]
 
 
@@ -248,7 +251,7 @@ def _problem(device: str, values: Values, measured: Values) -> str:
     if not all(np.isfinite(value).all() for value in values.values()):
         return "not finite"
     if device == "base":
-        return "" if np.all(np.abs(values["base.twist_command"]) <= FAST) else "too fast"
+        return "" if np.all(np.abs(whole(values["base.twist_command"])) <= FAST) else "too fast"
     if device in GROUPS:
         far = np.max(np.abs(values[f"{device}.position_command"] - measured[f"{device}.position_measured"]))
         return "" if far <= FAR else f"{far:.2f} rad off the measured position"
@@ -281,7 +284,7 @@ class Twin:
     """A simulated station behind LCM.
 
     station: its inputs are the robot's joints, its outputs its sensors. start: what its inputs hold at first.
-    speed: of each group's joints, as the program may ask for [1/s]. images,
+    speed: of each group's joints, as the program may ask for [1/s]. absent: devices that the robot lacks. images,
     rate: who makes the images of a paced twin, and how many.
     """
 
@@ -294,10 +297,12 @@ class Twin:
         camera: CameraConfig,
         faults: Faults,
         *,
+        absent: Collection[str] = (),
         images: LiveImages | None = None,
         rate: CameraRate | None = None,
         lcm: DrakeLcm | None = None,
     ):
+        self._reports = [row for row in REPORTS if row.device not in absent]
         self.station = station
         self.simulator = Simulator(station)
         self.context = self.simulator.get_mutable_context()
@@ -392,7 +397,7 @@ class Twin:
     def report(self) -> None:
         """Publishes what the sensors show now."""
         time, values = self.time, self._sense()
-        for row in REPORTS:
+        for row in self._reports:
             if self.faults.silent(row.device, time):
                 continue
             said = self.faults.frozen(row.key, time, values)

@@ -18,10 +18,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from valve_drake.checks import ConfigError
-from valve_drake.config import Config, number, numbers
+from valve_drake.config import Config, number
 from valve_drake.memory import changed
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, Health, ModeState, RobotState, SelectorReport
 from valve_drake.motion import follow
+from valve_drake.robot.drive import DIFFERENTIAL, Drive
 from valve_drake.robot.kinematics import Joints
 from valve_drake.task.modes import HOLD, OPEN, TABLE
 
@@ -38,15 +39,14 @@ SOURCE: dict[str, dict[str, str]] = {
 
 @dc.dataclass
 class CommandSelectorConfig(Config):
-    """Scenario key `command_selector`. Positions and speeds of the joints are bounded by the robot (robot.yaml).
+    """Scenario key `command_selector`. Positions and speeds of the joints, speeds and accelerations of the base are
+    bounded by the robot (robot.yaml).
 
     Upper bounds of times and forces are those of docs/hardware.md: a scenario can be stricter than what is promised
     there, and never laxer.
     """
 
     KEY = "command_selector"
-    base_speed: list[float] = numbers([0.8, 1.2], 0.05, (1.5, 2.0), "forward, yaw rate [m/s, rad/s]")
-    base_acceleration: list[float] = numbers([0.8, 2.0], 0.1, (1.5, 4.0), "forward, yaw rate [m/s^2, rad/s^2]")
     acceleration_torso: float = number(6.0, 0.5, 20.0, "of lift, waist, tilt and pan [m/s^2, rad/s^2]")
     acceleration_arm: float = number(8.0, 0.5, 20.0, "[rad/s^2]")
     gripper_high: float = number(0.09, 0.03, 0.09, "opening; the lower limit is 0 [m]")
@@ -72,12 +72,13 @@ class Bounds:
     high: np.ndarray  # (n,)
     speed: np.ndarray  # (n,) [1/s]
     acceleration: np.ndarray  # (n,) [1/s^2]
-    base_speed: np.ndarray  # (2,)
-    base_acceleration: np.ndarray  # (2,)
+    drive: Drive
 
 
-def bounds(config: CommandSelectorConfig, torso: Joints, arms: Mapping[str, Joints]) -> Bounds:
-    """torso, arms: of the robot, these by side."""
+def bounds(
+    config: CommandSelectorConfig, torso: Joints, arms: Mapping[str, Joints], drive: Drive = DIFFERENTIAL
+) -> Bounds:
+    """torso, arms, drive: of the robot, the arms by side."""
     c = config
     sizes = {"torso": len(torso)} | {f"{side}_arm": len(arms[side]) for side in SIDES} | dict.fromkeys(GRIPPERS, 1)
     ends = np.cumsum([sizes[group] for group in JOINTS]).tolist()
@@ -95,8 +96,7 @@ def bounds(config: CommandSelectorConfig, torso: Joints, arms: Mapping[str, Join
                 np.full(2, c.gripper_acceleration),
             ]
         ),
-        base_speed=np.array(c.base_speed),
-        base_acceleration=np.array(c.base_acceleration),
+        drive=drive,
     )
 
 
@@ -109,7 +109,7 @@ class Memory:
     velocity: np.ndarray  # (n,) of the command [1/s]
     target: np.ndarray  # (n,) what the sources asked for, within the position limits
     force: np.ndarray  # (2,) force limits of the grippers [N]
-    twist: np.ndarray  # (2,) of the base
+    twist: np.ndarray  # of the base, as many speeds as it has
     started: bool = False  # the measured position was taken over
     activation: int = -1
     over: tuple[int, int] = (0, 0)  # ticks in a row with a force above the trip
@@ -119,16 +119,20 @@ class Memory:
 
 def ports(bounds: Bounds) -> dict[str, int]:
     """The station's command ports: name -> size."""
-    out = {"base.twist_command": 2}
+    out = {"base.twist_command": len(bounds.drive.names)}
     out |= {f"{group}.position_command": part.stop - part.start for group, part in bounds.parts.items()}
     return out | {f"{group}.force_limit": 1 for group in GRIPPERS}
 
 
 def start(
-    config: CommandSelectorConfig, initial: Mapping[str, np.ndarray], torso: Joints, arms: Mapping[str, Joints]
+    config: CommandSelectorConfig,
+    initial: Mapping[str, np.ndarray],
+    torso: Joints,
+    arms: Mapping[str, Joints],
+    drive: Drive = DIFFERENTIAL,
 ) -> Memory:
     """Memory before the first step, holding `initial` (port name -> vector). Raises ConfigError if one does not fit."""
-    limits = bounds(config, torso, arms)
+    limits = bounds(config, torso, arms, drive)
     for port, size in ports(limits).items():
         if port not in initial or np.shape(initial[port]) != (size,) or not np.all(np.isfinite(initial[port])):
             raise ConfigError(f"command_selector: initial {port} must be {size} finite numbers")
@@ -185,7 +189,7 @@ def step(
             k = GRIPPERS.index(group)
             wanted[group] = np.array([config.gripper_high, m.force[k]])
             continue
-        value, problem = _asked(config, time, group, commands.get(block))
+        value, problem = _asked(config, time, group, commands.get(block), len(m.twist))
         if problem:
             refused.append(f"{group}: {problem}")
         if value is None:
@@ -253,9 +257,12 @@ def _sources(
 
 
 def _asked(
-    config: CommandSelectorConfig, time: float, group: str, command: Command | None
+    config: CommandSelectorConfig, time: float, group: str, command: Command | None, count: int
 ) -> tuple[np.ndarray | None, str]:
-    """What a block asks of a group, or None with the reason if it cannot be used ("" if it does not ask)."""
+    """What a block asks of a group, or None with the reason if it cannot be used ("" if it does not ask).
+
+    count: of the base's speeds.
+    """
     if command is None:
         return None, "no command"
     if not abs(time - command.time) <= config.max_age:
@@ -263,6 +270,8 @@ def _asked(
     value = getattr(command, "base_twist" if group == "base" else group)
     if value is None:
         return None, ""
+    if group == "base" and len(value) != count:
+        return None, f"a twist of {len(value)} speeds"
     if not all(map(math.isfinite, value.tolist())):  # of so few numbers a fifth of numpy's time
         return None, "not finite"
     if group in GRIPPERS and value[1] < 0:
@@ -271,9 +280,10 @@ def _asked(
 
 
 def _base(m: Memory, wanted: np.ndarray | None, dt: float) -> tuple[np.ndarray, list[str]]:
-    goal = (0.0, 0.0) if wanted is None else wanted.tolist()
+    now = m.twist.tolist()
+    goal = [0.0] * len(now) if wanted is None else wanted.tolist()
     twist, limits = [], set()
-    limited = zip(goal, m.twist.tolist(), m.bounds.base_speed.tolist(), m.bounds.base_acceleration.tolist())
+    limited = zip(goal, now, m.bounds.drive.speed.tolist(), m.bounds.drive.acceleration.tolist())
     for asked, now, speed, acceleration in limited:
         allowed = min(max(asked, -speed), speed)
         step = acceleration * dt
@@ -377,7 +387,7 @@ def _follow(
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Counts ticks for which each group is behind its last command; written so that NaN is behind."""
     commanded = m.position.tolist()
-    near = {"base": _close(state.odometry.tolist()[3:], m.twist.tolist(), config.follow_speed)}
+    near = {"base": _close(state.twist.tolist(), m.twist.tolist(), config.follow_speed)}
     for group, found in zip(("torso", *ARMS), (state.torso, state.left_arm, state.right_arm)):
         near[group] = _close(found.tolist(), commanded[m.bounds.parts[group]], config.follow_error)
     behind = tuple(0 if near[group] else count + 1 for group, count in zip(FOLLOWERS, m.behind))

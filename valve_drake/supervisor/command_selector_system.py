@@ -6,6 +6,7 @@ import numpy as np
 
 from valve_drake.messages import Command, Health, ModeState, RobotState, SelectorReport
 from valve_drake.ports import Block, Inputs, Outputs
+from valve_drake.robot.drive import DIFFERENTIAL, Drive
 from valve_drake.robot.kinematics import Joints
 from valve_drake.supervisor.command_selector import (
     SOURCE,
@@ -38,15 +39,15 @@ class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
     robot_state                      in   RobotState
     health                           in   Health          of the station
     (every behaviour)                in   Command         one port each, named after it
-    base.twist_command               out  vector(2)       forward [m/s], yaw rate [rad/s]
+    base.twist_command               out  vector          the speeds that the base has [m/s, rad/s]
     torso.position_command           out  vector          [m, rad]
     {side}_arm.position_command      out  vector          [rad]
     {side}_gripper.position_command  out  vector(1)       opening [m]
     {side}_gripper.force_limit       out  vector(1)       [N]
     report                           out  SelectorReport
 
-    initial: what the output vectors hold until the first robot state, by port name. torso, arms: of the
-    robot, these by side.
+    initial: what the output vectors hold until the first robot state, by port name. torso, arms, drive: of the
+    robot, the arms by side.
     """
 
     INPUTS = dict.fromkeys(BEHAVIORS, Command())
@@ -57,11 +58,12 @@ class CommandSelectorSystem(Block[CommandSelectorInputs, Memory]):
         initial: Mapping[str, np.ndarray],
         torso: Joints,
         arms: Mapping[str, Joints],
+        drive: Drive = DIFFERENTIAL,
         name: str = "command_selector",
     ):
         config.check()
         self.config = config
-        self._start = start(config, initial, torso, arms)
+        self._start = start(config, initial, torso, arms, drive)
         self.OUTPUTS = ports(self._start.bounds) | {"report": SelectorReport}
         super().__init__(name, slot=2)
 
