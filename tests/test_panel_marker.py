@@ -9,14 +9,19 @@ import pytest
 from drawn_scene import edge_points, facing
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
+from robot_facts import ROBOT
 
 from valve_drake import frames
 from valve_drake import scenario as scenarios
+from valve_drake.behaviors.kinematic_approach import KinematicApproach, KinematicApproachConfig
 from valve_drake.camera.lens import load_head
-from valve_drake.messages import RectangleEstimate
+from valve_drake.messages import GraspPlan, RectangleEstimate, RobotState, TurnState
 from valve_drake.perception.ambiguity import Track
 from valve_drake.perception.fusion import fuse
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, estimate
+from valve_drake.recording.robot_frames import RobotFrames
+from valve_drake.robot import description
+from valve_drake.robot.robot import Robot
 from valve_drake.valve.model import add_valve, marker_frame
 from valve_drake.valve.valve import Valve, angle_turned, turned
 
@@ -128,3 +133,28 @@ def test_its_frame_and_picture_do_not_turn_with_the_wheel():
         poses.append(plant.CalcRelativeTransform(context, axis, marker).GetAsMatrix34())
     expected = frames.compose(frames.inverse(shape.X_AP()), shape.X_AV())
     assert poses[0] == pytest.approx(expected) and poses[1] == pytest.approx(expected)
+
+
+def test_the_log_shows_it_with_the_panel_and_the_wheel_as_the_hands_turned_it():
+    shape = valve()
+    show = RobotFrames(Robot.load(description.find(description.OURS), shape), HEAD)
+    X_OL = frames.make(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.0, 0.0, 1.4]))
+    X_LV = frames.make(np.eye(3), np.array([0.0, 0.3, 0.8]))
+    estimate = RectangleEstimate(found=True, X_LV=X_LV, X_OL=X_OL, angle=0.3, angle_seen=True)
+    X_OV = frames.compose(X_OL, X_LV)
+    state = RobotState(torso=np.zeros(3), left_arm=np.zeros(6), right_arm=np.zeros(6))
+    plan = GraspPlan(number=1, found=True, X_BA=shape.place(X_OV, 0.3))
+    for turn, angle in ((TurnState(), 0.3), (TurnState(number=1, angle=0.5), 0.8)):
+        found = {child: X for _, child, X in show(state, estimate, plan, turn)}
+        assert found["marker"] == pytest.approx(X_OV)
+        assert found["valve::panel"] == pytest.approx(frames.compose(X_OV, shape.X_VA(), shape.X_AP()))
+        assert found["valve::wheel"] == pytest.approx(frames.compose(shape.place(X_OV, angle), shape.X_AP()))
+
+
+def test_the_turn_is_counted_by_the_marks_and_the_hands_tell_what_looks_the_same():
+    X_OA = frames.make(np.eye(3), np.array([2.0, 0.0, 1.0]))
+    for handles, off in ((BAR, 1.4), (UNEVEN, 3.0)):
+        law = KinematicApproach(KinematicApproachConfig(), ROBOT, valve(handles), {"left": 1.0, "right": 1.0})
+        for true in (0.3, 2.0, 6.0, 12.5):
+            seen = law.seen_angle(X_OA, turned(X_OA, true), False, true + off)
+            assert seen == pytest.approx(true)
