@@ -1,5 +1,7 @@
 """Bases that go sideways and bases that do not move: twists, station, wire and names follow robot.yaml's base.drive."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydrake.lcm import DrakeLcm
@@ -9,7 +11,7 @@ from robot_variants import fixed, holonomic, variant, without_base_joints
 
 from valve_drake import rehearsal
 from valve_drake.checks import ConfigError
-from valve_drake.diagram import initial_commands, make_diagram, make_station
+from valve_drake.diagram import initial_commands, make_diagram, make_station, robot_of
 from valve_drake.messages import RobotState
 from valve_drake.recording.signals import commanded, measured
 from valve_drake.robot.drive import DIFFERENTIAL, drive, whole
@@ -36,7 +38,7 @@ def bolted(tmp_path_factory):
 
 def scenario_of(path, *overrides):
     quiet = [f"simulation.error.{name}=0" for name in QUIET]
-    near = [f"simulation.start.{setting}" for setting in NEAR]
+    near = [f"simulation.start.{setting}" for setting in NEAR] if "fixed" in Path(path).read_text() else []
     return resolve(load(None, [f"robot={path}", *quiet, *near, *overrides]))
 
 
@@ -177,6 +179,15 @@ def test_a_robot_of_another_base_is_refused_over_the_wire(omni):
     link = RobotLink(Bus(scenario.hardware, lcm), ROBOT.groups, idle=twin.poll)
     with pytest.raises(ConfigError, match="not the robot of this program: base: 6 values, want 5"):
         link.start()
+
+
+def test_only_a_fixed_base_begins_right_before_the_valve(omni, bolted):
+    for path in (omni, None):
+        robot = [] if path is None else [f"robot={path}"]
+        for distance in ("0.8", "!Uniform {min: 0.8, max: 2.0}"):
+            with pytest.raises(ConfigError, match="start.distance must be at least 0.9 for a base that drives"):
+                robot_of(load(None, [*robot, f"simulation.start.distance={distance}"]))
+    robot_of(load(None, [f"robot={bolted}", "simulation.start.distance=0.7"]))
 
 
 def test_a_state_tells_the_speeds_that_the_base_has():

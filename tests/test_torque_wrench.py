@@ -2,17 +2,21 @@
 
 import numpy as np
 import pytest
+from pydrake.lcm import DrakeLcm
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.tree import MultibodyForces
 from pydrake.systems.analysis import Simulator
 from robot_facts import ROBOT
 from robot_variants import seven_joints, variant, with_roll, without_force_sensors
 
+from valve_drake import rehearsal
 from valve_drake.diagram import initial_commands, make_station
 from valve_drake.messages import LEFT, SIDES
 from valve_drake.robot.kinematics import wrench
 from valve_drake.robot.robot import Robot
 from valve_drake.scenario import load, resolve
+from valve_drake.stations.bus import Bus
+from valve_drake.stations.hardware import RobotLink, make_hardware_station
 
 FORCES = [np.array([1.0, -2.0, 0.5, 12.0, -20.0, 7.0]), np.array([0.0, 0.0, 0.0, 0.0, 0.0, -30.0])]
 
@@ -128,3 +132,27 @@ def test_the_station_computes_the_wrench_on_the_port_of_the_sensor_that_there_is
         assert np.abs(wrenches.mean(axis=0)[3:]).max() < 3 * 0.2 * sigma.max()  # the biases alone: no weight
     assert {"left_wrist_sensor", "right_wrist_sensor"}.isdisjoint(health.devices)
     assert set(ROBOT.groups.absent) == set()
+
+
+def test_over_the_wire_the_same_wrench_comes_of_what_the_joints_report(tmp_path):
+    path = variant(tmp_path, change=without_force_sensors)
+    settings = [f"robot={path}", "hardware.lcm_url='memq://'", "hardware.lockstep=true"]
+    scenario, lcm = resolve(load(None, settings)), DrakeLcm("memq://")
+    robot, twin = Robot.load(path), rehearsal.make_twin(scenario, lcm=lcm)
+    link = RobotLink(Bus(scenario.hardware, lcm), robot.groups, idle=twin.poll)
+    station = make_hardware_station(link, robot)
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    for port, value in initial_commands(scenario).items():
+        station.GetInputPort(port).FixValue(context, value)
+    simulator.AdvanceTo(0.2)
+
+    def read(name):
+        return station.GetOutputPort(name).Eval(context)
+
+    for side in SIDES:
+        joints = [read(f"{side}_arm.{what}_measured") for what in ("position", "velocity", "torque")]
+        wanted = robot.torque_wrench(side, *joints, read("torso.position_measured")[:1])
+        assert read(f"{side}_wrist.wrench") == pytest.approx(wanted) and np.isfinite(wanted).all()
+    assert read("health").faults == () and "left_wrist_sensor" not in read("health").devices
+    link.leave()

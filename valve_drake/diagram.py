@@ -34,6 +34,7 @@ from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError, require
 from valve_drake.collision import CollisionModel
+from valve_drake.config import Uniform
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import SIDES, OperatorCommand, OperatorPackets
 from valve_drake.operator.operator_channel_system import OperatorChannelSystem
@@ -63,6 +64,7 @@ from valve_drake.supervisor.supervisor_system import SupervisorSystem
 from valve_drake.task.modes import BEHAVIORS
 from valve_drake.valve.valve import turned
 
+DRIVING_START = 0.9  # a robot that drives begins no nearer to the valve: its base and arms are clear of the panel [m]
 MEASURED = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and not isinstance(spec.kind, type))
 
 WIRES: tuple[tuple[str, str], ...] = (
@@ -174,6 +176,10 @@ def robot_of(scenario: Scenario) -> Robot:
         require(d.opening >= least, "opening", f"at least {least:g}: valve.handles.width and room", d.opening)
     except ConfigError as error:
         raise ConfigError(f"{scenario.robot}: {error}") from error
+    distance = scenario.simulation.start.distance
+    least = distance.min if isinstance(distance, Uniform) else distance
+    words = f"at least {DRIVING_START:g} for a base that drives"
+    require(robot.drive.fixed or least >= DRIVING_START, "simulation.start.distance", words, least)
     return robot
 
 
