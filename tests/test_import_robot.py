@@ -866,6 +866,18 @@ def test_the_draft_knows_arms_grippers_head_and_lift(tmp_path):
     assert len(tree["arm_speed"]) == 5 and "weld" not in tree
 
 
+def test_the_draft_of_an_arm_without_a_fixed_joint_states_how_well_its_torques_are_read(tmp_path):
+    turns = '<axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="20" velocity="2"/></joint>'
+    parts = [
+        part.replace('type="fixed"', 'type="revolute"').replace("</joint>", turns) if "ft_sensor" in part else part
+        for part in two_arms(6)
+    ]
+    code, folder = imported(tmp_path, *parts)
+    arm = yaml_file.read(folder / "robot.yaml")["arms"]["left"]
+    assert code == 0 and arm["sensor"] == "torque" and len(arm["torque_noise"]) == len(arm["joints"]) == 7
+    assert arm["torque_noise"][-1] == 0.1 and "TODO arms.*.torque_noise" in (folder / "robot.yaml").read_text()
+
+
 def test_a_camera_that_looks_along_x_gets_a_frame_that_looks_along_z(tmp_path):
     straight = [part.replace('rpy="-1.5708 0 -1.5708"', 'rpy="0 0 0"') for part in two_arms()]
     code, folder = imported(tmp_path, *(part.replace("eye_optical_frame", "eye_link") for part in straight))

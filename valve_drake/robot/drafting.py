@@ -19,6 +19,7 @@ SNAP = math.radians(15)  # a grip's axis this near to an axis of its link is tha
 PAD_LENGTH = 0.02  # of a pad's surface; half of it on either side of its middle [m]
 _OPTICAL = (-math.pi / 2, 0.0, -math.pi / 2)  # roll, pitch, yaw from x forward, z up to z forward, x to the right
 STIFFNESS_PER_EFFORT = 130.0  # a joint's stiffness [N m/rad] for each N m of its limit: full effort at 8 mrad
+NOISE_PER_EFFORT = 0.005  # a guess at what a joint's torque reads off by, as a share of its limit
 Ask = Callable[[str], str]  # notes what is to be done -> the comment that says it
 Boxes = Mapping[str, np.ndarray]  # link -> (2, 3) least and greatest corner of its shapes in its own frame [m]
 
@@ -416,7 +417,9 @@ def _arm_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
         sensor = found.hands[side].sensor
         if sensor is None:
             say_ = ask("arms.*.sensor: no fixed joint beyond the arm: forces come from the joints' torques")
-            lines.append(f"    sensor: torque  {say_}")
+            noise = ask("arms.*.torque_noise: of a joint's torque reading, standard deviation [N m]")
+            guess = [round(NOISE_PER_EFFORT * (effort or 1.0), 3) for effort in efforts]
+            lines += [f"    sensor: torque  {say_}", f"    torque_noise: {_flow(guess)}  {noise}"]
         else:
             lines.append(
                 f"    sensor: {_key(sensor)}  " + say("arms.*.sensor: the fixed joint in which forces are measured")
