@@ -137,6 +137,7 @@ def test_the_station_computes_the_wrench_on_the_port_of_the_sensor_that_there_is
 def test_over_the_wire_the_same_wrench_comes_of_what_the_joints_report(tmp_path):
     path = variant(tmp_path, change=without_force_sensors)
     settings = [f"robot={path}", "hardware.lcm_url='memq://'", "hardware.lockstep=true"]
+    settings.append("faults=[{kind: dead, device: left_arm, start: 0.3}]")
     scenario, lcm = resolve(load(None, settings)), DrakeLcm("memq://")
     robot, twin = Robot.load(path), rehearsal.make_twin(scenario, lcm=lcm)
     link = RobotLink(Bus(scenario.hardware, lcm), robot.groups, idle=twin.poll)
@@ -155,4 +156,7 @@ def test_over_the_wire_the_same_wrench_comes_of_what_the_joints_report(tmp_path)
         wanted = robot.torque_wrench(side, *joints, read("torso.position_measured")[:1])
         assert read(f"{side}_wrist.wrench") == pytest.approx(wanted) and np.isfinite(wanted).all()
     assert read("health").faults == () and "left_wrist_sensor" not in read("health").devices
+    simulator.AdvanceTo(0.5)  # the left arm has said nothing for 0.2 s: its force is not known, its joints are
+    assert np.isnan(read("left_wrist.wrench")).all() and np.isfinite(read("right_wrist.wrench")).all()
+    assert np.isfinite(read("left_arm.position_measured")).all()
     link.leave()

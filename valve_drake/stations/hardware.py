@@ -160,6 +160,11 @@ class RobotLink:
         self._sizes = vectors(groups)
         self._silent = [SAID_BY[device] for device in groups.absent]
         self._said, self._told = present(REPORTS, groups), present(COMMANDS, groups)
+        # Reports of what is never still for noise, and the port that tells of a force: unknown when they stay away.
+        self._forces = {f"{side}_wrist_sensor.status": f"{side}_wrist.wrench" for side in SIDES}
+        for side in SIDES:
+            if f"{side}_wrist_sensor" in groups.absent:
+                self._forces[f"{side}_arm.status"] = f"{side}_arm.torque_measured"
         self._devices = tuple(device for device in DEVICES if device not in groups.absent)
         self.stop = stop
         self._config = bus.config
@@ -230,7 +235,7 @@ class RobotLink:
             arrival = last.arrival  # the port shows NaN nevertheless: an unknown force must not look known
         else:
             self._bad.good(row.device, arrival)
-            if last is not None and _frozen(key, values, last.values):
+            if last is not None and _frozen(key, values, last.values, key in self._forces):
                 arrival = last.arrival
         self._reports[key] = _Report(arrival, values)
         if row.read is not None:
@@ -369,8 +374,10 @@ class RobotLink:
         values: Values = {name: np.zeros(self._sizes[name]) for name in self._silent}
         for row in self._said:
             report = self._reports[row.key]
-            silent = row.key in NEVER_STILL and not now - report.arrival <= self._config.report_age
-            values |= {port: np.full_like(v, np.nan) for port, v in report.values.items()} if silent else report.values
+            values |= report.values
+            if row.key in self._forces and not now - report.arrival <= self._config.report_age:
+                port = self._forces[row.key]
+                values[port] = np.full_like(report.values[port], np.nan)
         if round(time / TICK) % HEALTH_TICKS == 0:
             self._health = self._diagnose(now, time)
         self._time = time + TICK
@@ -488,7 +495,7 @@ def _sound(values: Values | Mapping[str, float] | None) -> bool:
     return values is None or all(bool(np.all(np.abs(value) <= ABSURD)) for value in values.values())
 
 
-def _frozen(key: str, values: Values | None, last: Values | None) -> bool:
+def _frozen(key: str, values: Values | None, last: Values | None, noisy: bool) -> bool:
     """The same values again, from a sensor with noise or a device that reports a speed."""
     row = CHANNELS[key]
     if (
@@ -499,7 +506,7 @@ def _frozen(key: str, values: Values | None, last: Values | None) -> bool:
     ):
         return False
     speeds = [v[3:] if port == "base.odometry" else v for port, v in values.items() if port in SPEEDS]
-    return key in NEVER_STILL or any(np.max(np.abs(speed)) > MOVING for speed in speeds)
+    return noisy or any(np.max(np.abs(speed)) > MOVING for speed in speeds)
 
 
 class LcmReceiver(PythonSystem):
