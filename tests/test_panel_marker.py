@@ -31,8 +31,8 @@ BAR = "{xyz: [0.15, 0, 0]}, {xyz: [-0.15, 0, 0]}"
 UNEVEN = "{xyz: [0.15, 0, 0]}, {xyz: [-0.075, 0.13, 0]}, {xyz: [0, -0.12, 0]}"
 
 
-def valve(handles: str = BAR, marker: str = "xyz: [0, -0.24, 0.085]") -> Valve:
-    text = f"valve: {{model: '', marker: {{carrier: panel, size: [0.08, 0.08], {marker}}}, handles: [{handles}]}}"
+def valve(handles: str = BAR, marker: str = "xyz: [0, -0.225, 0.085]") -> Valve:
+    text = f"valve: {{model: '', marker: {{carrier: panel, size: [0.06, 0.06], {marker}}}, handles: [{handles}]}}"
     scenario = scenarios.parse(text, "a file")
     scenario.check()
     return scenario.valve
@@ -63,7 +63,7 @@ def test_the_marks_tell_the_angle_wherever_on_their_circles_they_are(angle):
 
 
 def test_a_bar_that_looks_the_same_after_half_a_turn_is_followed_from_image_to_image():
-    shape, X = valve(), facing(1.1, -0.1, 0.35, 0.0, 0.0, -0.12)
+    shape, X = valve(), facing(1.3, -0.1, 0.35, 0.0, 0.0, -0.16)
     angle, track = 0.0, None
     for true in np.arange(0.0, 7.0, 0.5):
         found = look(shape, X, true, track)
@@ -77,7 +77,7 @@ def test_a_bar_that_looks_the_same_after_half_a_turn_is_followed_from_image_to_i
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5 * math.pi, -0.5 * math.pi, 3.0])
 def test_the_side_on_which_the_marks_turn_tells_the_axes_of_the_marker(yaw):
-    shape = valve(marker=f"xyz: [0, -0.24, 0.085], rpy: [0, 0, {yaw}]")
+    shape = valve(marker=f"xyz: [0, -0.225, 0.085], rpy: [0, 0, {yaw}]")
     X = frames.compose(facing(1.3, 0.1, 0.35, 0.0, 0.0, -0.12), frames.make(frames.rot_z(yaw), np.zeros(3)))
     for first in range(4):
         found = look(shape, X, 0.4, first=first)
@@ -114,10 +114,10 @@ def test_the_axis_turns_by_the_marks_angle_and_looks_are_fused_so():
 def test_the_head_looks_between_marker_and_axis():
     look = valve().look()
     assert np.linalg.norm(look) == pytest.approx(0.11) and look / 0.11 == pytest.approx(
-        np.array([0.0, 0.24, -0.085]) / math.hypot(0.24, 0.085)
+        np.array([0.0, 0.225, -0.085]) / math.hypot(0.225, 0.085)
     )
     assert Valve().look() is None
-    assert valve().target().reach() == pytest.approx((0.24 + 0.15) / 0.08)
+    assert valve().target().reach() == pytest.approx((0.225 + 0.15) / 0.06)
 
 
 def test_its_frame_and_picture_do_not_turn_with_the_wheel():

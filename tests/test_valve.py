@@ -33,7 +33,7 @@ def valve(text: str) -> Valve:
     return scenario.valve
 
 
-PANEL = "valve: {marker: {carrier: panel, xyz: %s}}"
+PANEL = "valve: {marker: {carrier: panel, size: [0.06, 0.06], xyz: %s}}"
 HANDLES = "valve: {model: '', handles: [%s]}"
 GOOD = "{xyz: [0.15, 0, 0]}, {xyz: [-0.15, 0, 0]}"
 
@@ -46,8 +46,8 @@ WRONG = {
     "valve: {marker: {size: [0.2, 0.2]}}": "valve.marker.size must be not larger than the face",
     "valve: {marker: {xyz: [0, 0, 0.2]}}": "valve.marker.xyz must be before the panel",
     "valve: {marker: {rpy: [1.2, 0, 0]}}": "valve.marker.rpy must be facing the robot",
-    PANEL % "[0, -0.2, 0.085]": "valve.marker.xyz must be at least 0.251 m off the axis on a panel",
-    PANEL % "[0, -0.4, 0.085]": "valve.marker.xyz must be at most 0.27 m off the axis on a panel",
+    PANEL % "[0, -0.2, 0.085]": "valve.marker.xyz must be at least 0.223 m off the axis on a panel",
+    PANEL % "[0, -0.4, 0.085]": "valve.marker.xyz must be at most 0.235 m off the axis on a panel",
     "valve: {marker: {carrier: panel}, handles: [{xyz: [0.2, 0, 0]}, {xyz: [-0.2, 0, 0]}]}": (
         "valve.marker.carrier must be wheel: a panel's marker beside these handles, 0.301 m off the axis, is not seen"
     ),
@@ -80,7 +80,7 @@ MODELS = {
     "valve: {model: robot/robot.sdf}": "valve.model: stem must be a joint of the model",
     "valve: {handles: [{xyz: [0.2, 0, 0]}, {xyz: [-0.15, 0, 0]}]}": "valve.handles[0].xyz must be where valve.model",
     "valve: {marker: {xyz: [0.06, 0, -0.041]}}": "valve.marker.xyz must be where valve.model has its frame marker",
-    PANEL % "[0, -0.26, 0.085]": "valve.marker.carrier must be where valve.model has its frame marker, wheel",
+    PANEL % "[0, -0.23, 0.085]": "valve.marker.carrier must be where valve.model has its frame marker, wheel",
     "valve: {panel: {depth: 0.12}}": "where valve.model has its frame",
 }
 

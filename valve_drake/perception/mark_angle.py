@@ -14,7 +14,7 @@ from valve_drake import frames
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.views import View
 
-_OFF = 0.2  # a spot so far from a mark's circle is another thing [radii]
+_OFF = 0.12  # a spot so far from a mark's circle is another thing [radii]
 _ALIKE = 0.1  # marks that propose angles so near to each other agree: the marker's pose is as good as that [rad]
 _TOGETHER = 0.03  # the mean is of those that are so near to it [rad]
 _SPOT = 0.7  # standard deviation of a green spot's middle [px]
