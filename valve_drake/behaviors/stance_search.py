@@ -34,7 +34,7 @@ class StanceSearch:
     turn_angle: float
     places: tuple[tuple[Place, ...], ...]
     kept: bool = False  # the first group keeps a lift where it is: it will do where it is accepted
-    dense: int = 100  # groups from this one on are tried only if nothing before is accepted
+    dense: int = 100  # groups from this one on are tried only if nothing before is accepted, and with one grasp
     group: int = 0
     index: int = 0  # of the next place in its group
     split: bool = False  # in the second round: by several grasps, where no place serves with one
@@ -93,8 +93,8 @@ class Stances(GraspSearch):
         self, X_OA: np.ndarray, viewer: np.ndarray, posture: np.ndarray | None
     ) -> tuple[tuple[tuple[Place, ...], ...], int]:
         """Square to the panel, from near to far; first with the lift as given, then at home, then at other heights,
-        then a step aside. Where the robot may stand at many distances, a few of them, and then all -> groups, and from
-        which on it is all of them."""
+        then a step aside. Where the robot may stand at many distances, a few of them; all, at home, come last ->
+        groups, and which is the first of all distances."""
         c: StanceConfig = self.config
         angle = heading(X_OA, viewer)
         left = np.array([-np.sin(angle), np.cos(angle)])
@@ -108,8 +108,7 @@ class Stances(GraspSearch):
         if posture is not None and self.robot.lift:
             kept = tuple(Place(base, posture) for base in bases)
             groups = [kept, *(groups if np.max(np.abs(posture - home)) > 1e-3 else [])]
-        raised = self._postures()
-        if raised:
+        if raised := self._postures():
             groups.append(tuple(Place(base, posture) for posture in raised for base in bases))
         if self.bolted:
             return tuple(groups), len(groups)
@@ -121,7 +120,6 @@ class Stances(GraspSearch):
         dense = len(groups)
         if thin > 1:
             groups.append(tuple(Place(base) for base in every))
-            groups.append(tuple(Place(base, posture) for posture in raised for base in every))
         return tuple(group for group in groups if group), dense
 
     def _postures(self) -> list[np.ndarray]:
@@ -154,7 +152,7 @@ class Stances(GraspSearch):
         if index == len(s.places[group]):
             group, index = group + 1, 0
         good = c.margin_min if (s.kept and group == 1) or group >= s.dense else c.margin_good
-        more = group < len(s.places) and (index > 0 or s.margin < good)
+        more = group < (min(s.dense, len(s.places)) if s.split else len(s.places)) and (index > 0 or s.margin < good)
         done = s.margin >= c.margin_enough or not more
         if done and s.instead is not None and s.margin < s.wanted:
             return s.instead
