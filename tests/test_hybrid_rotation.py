@@ -12,7 +12,15 @@ from helpers import Rig, assert_clones_are_independent, assert_holds_between_upd
 from robot_facts import ROBOT
 
 from valve_drake.behaviors import hybrid_rotation_turn
-from valve_drake.behaviors.closed_chain import contact_wrench, gravity_wrench, make_chain, turn_rate, twists
+from valve_drake.behaviors.closed_chain import (
+    BELOW_TRIP,
+    contact_wrench,
+    gravity_wrench,
+    make_chain,
+    torque_limit,
+    turn_rate,
+    twists,
+)
 from valve_drake.behaviors.grasp_geometry import Turn
 from valve_drake.behaviors.hybrid_rotation import HybridRotation, Memory
 from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
@@ -276,7 +284,7 @@ def test_without_the_couple_in_the_relative_target_the_hands_yield_to_it(monkeyp
     """
     law = hybrid_rotation_turn.twists
 
-    def naive(chain, rate, config, extra):
+    def naive(chain, rate, config, extra, *_):
         return law(dc.replace(chain, torque=0.0), rate, config, extra)
 
     soft = grasped()
@@ -342,6 +350,27 @@ def test_a_seized_valve_is_stuck_without_wind_up(spin):
     assert waiting[:, 3].max() < 1.05 * CONFIG.torque_limit
     assert np.abs(record[-1, 3]) < 1.05 * CONFIG.torque_limit
     assert record[-1, 0] - record[0, 0] < 3 * CONFIG.stall_time  # soon
+
+
+def test_a_valve_that_is_stiff_is_tried_in_the_other_sense_and_then_with_all_the_torque_that_is_allowed():
+    friction = 0.9 * CONFIG.torque_limit
+    bench, stages = grasped(friction), []
+    status = bench.run(Mode.TURN, 0.2, each=lambda b: stages.append((b.memory.stage, abs(b.record()[-1, 3]))))
+    assert status.state == "succeeded", status.detail
+    assert bench.angle == pytest.approx(0.2, abs=np.radians(1.0))
+    order = [stage for k, (stage, _) in enumerate(stages) if k == 0 or stages[k - 1][0] != stage]
+    assert order[:3] == ["turn", "back", "turn"]
+    first = [torque for stage, torque in stages[: [stage for stage, _ in stages].index("back")]]
+    assert max(first) < 1.05 * CONFIG.gentle * CONFIG.torque_limit
+    assert max(torque for _, torque in stages) < 1.05 * CONFIG.torque_limit
+
+
+def test_near_the_axis_the_torque_is_bounded_by_what_a_hand_may_push():
+    chain = chain_with()
+    assert torque_limit(chain, CONFIG, 1.0) == CONFIG.torque_limit  # at 0.15 m
+    small = dc.replace(chain, r=np.array([0.08, 0.08]))
+    assert torque_limit(small, CONFIG, 1.0) == pytest.approx(BELOW_TRIP * CONFIG.force_trip * 0.16)
+    assert torque_limit(small, CONFIG, 0.5) == pytest.approx(torque_limit(small, CONFIG, 1.0) / 2)
 
 
 @pytest.mark.parametrize("stop, spin", [(50, 1.0), (10, 100.0)])

@@ -467,6 +467,32 @@ def test_a_rectangle_that_looks_alike_after_part_of_a_turn_is_counted_by_the_han
     assert bench.law.seen_angle(X_OA, turned(X_OA, 0.2 + np.pi), True, 0.1) == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize("known, off", [(True, np.radians(60)), (False, np.radians(30))])
+@pytest.mark.parametrize("mode", [Mode.VERIFY, Mode.MEASURE])
+def test_a_turn_whose_count_could_have_lost_a_turn_is_told_so(base, mode, known, off):
+    for less, lost in ((off, True), (off / 3, False)):
+        bench = Bench(base).at_standoff()
+        bench.turn, bench.X_OA, bench.axis_known = bench.felt(QUARTER), turned(X_OA, QUARTER - less), known
+        status = bench.run(mode, turn_angle=2 * np.pi)
+        assert (status.cause == Cause.LOST_COUNT) == lost
+        if lost:
+            assert (status.state, status.verdict) == ("failed", "unverified")
+            assert f"tracking was lost: camera sees {90 - np.degrees(off):.0f}" in status.detail
+
+
+@pytest.mark.parametrize("shift, known", [([0.1, 0, 0], True), ([0.01, 0, 0], False)])
+def test_the_way_home_keeps_clear_of_a_valve_that_was_moved(base, shift, known):
+    asked = []
+    bench = Bench(base, lambda X_BA, q, _=None: not asked.append(X_BA)).at_standoff()
+    bench.X_OA = make(X_OA[:, :3], X_OA[:, 3] + shift)
+    bench.run(Mode.SERVO, limit=0.5)
+    asked.clear()
+    bench.run(Mode.FOLD)
+    there = compose(planar(*base), asked[0])[:, 3]
+    assert there == pytest.approx(X_OA[:, 3] + (shift if known else [0, 0, 0]), abs=0.006)
+    assert asked[0][:, :3] == pytest.approx(bench.memory.plan.X_BA[:, :3])
+
+
 def test_the_way_home_keeps_clear_of_the_valve_as_the_hands_left_it(base):
     asked = []
     bench, _ = verify(base, 0.6, 0.58, 0.6, is_free=lambda X_BA, q, _=None: not asked.append(X_BA))
@@ -535,6 +561,7 @@ def test_a_marker_that_is_not_seen_again_ends_unverified_with_what_the_hands_kno
     status = bench.run(Mode.VERIFY, limit=30.0)
     assert (status.state, status.verdict) == ("failed", "unverified")
     assert status.detail == "camera does not see the marker, hands turned 89.90 deg of 90.00 deg"
+    assert status.cause == Cause.UNSEEN
     assert (
         bench.time - start < SupervisorConfig().deadline["verify"]
     )  # its own word comes before the supervisor's timeout

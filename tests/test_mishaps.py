@@ -5,6 +5,7 @@ import dataclasses as dc
 import numpy as np
 import pytest
 from hands_at_valve import SHUT, VALVE, Hands, at_handle
+from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.analysis import Simulator
 from robot_facts import ROBOT
 from test_station import NEAR, PERFECT, Rig
@@ -14,6 +15,7 @@ from valve_drake import scenario as scenarios
 from valve_drake.checks import ConfigError
 from valve_drake.messages import LEFT, RIGHT, SIDES, ModeState, OperatorCommand
 from valve_drake.stations.mishaps import OPENING_FORCE, InterruptingOperator, LostGripSystem
+from valve_drake.stations.rails import COVER, CREEP, SPEED, STAND, Rail
 from valve_drake.stations.simulation_config import MishapConfig
 
 LEVELS = sorted((resources.diagrams() / "levels").glob("level5_*.scenario.yaml"))
@@ -89,6 +91,55 @@ def test_the_cameras_see_nothing_while_the_lamps_are_out():
     assert bright[1] < 10 < 50 < min(bright[0], bright[2])
 
 
+PUSHED, COVERED = "simulation.valve.pushed", "simulation.valve.covered"
+
+
+@pytest.mark.parametrize("by", [0.1, -0.06])
+def test_a_valves_stand_is_pushed_aside_once_a_hand_is_near_and_stays_there(by):
+    rig = Rig([f"{PUSHED}_at=2.0", f"{PUSHED}_by={by}", "simulation.valve.yaw=0.0"])
+    before = rig.read("truth.marker_pose").reshape(3, 4)
+    places = [rig.run(time).read("truth.marker_pose").reshape(3, 4) for time in (0.2, 0.6, 1.0)]
+    assert np.linalg.norm(places[0][:, 3] - before[:, 3]) == pytest.approx(0.25 * 0.2, abs=0.01)  # it takes its time
+    for place in places[1:]:
+        assert place[:, 3] - before[:, 3] == pytest.approx([0, -by, 0], abs=1e-4)
+        assert place[:, :3] == pytest.approx(before[:, :3], abs=1e-4)
+
+
+def test_a_valves_stand_stays_where_it_is_while_no_hand_is_near():
+    rig = Rig([f"{PUSHED}_at=0.1"])
+    before = rig.read("truth.marker_pose").copy()
+    assert rig.run(0.5).read("truth.marker_pose") == pytest.approx(before, abs=1e-5)
+
+
+def test_a_rail_waits_then_goes_stays_on_its_way_and_goes_on():
+    rail, step = Rail(ModelInstanceIndex(2), "cover", near=0.3, end=-0.3, stay=0.1, stay_for=2.0), 1 / 256
+    assert rail.desired(0.0, 0.31, step) == (0.0, 0.0)
+    q, time, stays = 0.0, 0.0, []
+    while q != -0.3:
+        q, _ = rail.desired(q, 0.29 if time < 0.01 else 1.0, step)  # who has come may go
+        time += step
+        stays += [time] if 0.1 <= -q < 0.1 + CREEP else []
+        assert time < 10
+    assert stays[-1] - stays[0] == pytest.approx(2.0, abs=0.1)
+    assert time == pytest.approx(2.0 + 0.3 / SPEED, abs=0.1)
+    assert rail.desired(q, 1.0, step) == (-0.3, 0.0)
+
+
+def test_a_cover_hides_half_of_the_marker_for_its_time():
+    rig = Rig([f"{COVERED}_at=4.0", f"{COVERED}_for=1.0", "simulation.start.distance=3.0", "simulation.valve.yaw=0.0"])
+
+    def red(time):
+        image = rig.run(time).read("head_left.image").image.astype(int)
+        return (image[..., 0] > 90) & (image[..., 1:].max(2) < 60)
+
+    before, half, after = red(0.4), red(1.8), red(4.5)
+    rows, columns = np.nonzero(before & ~half)
+    marker = before[:, columns.min() : columns.max() + 1]  # the room has other red things beside it
+    assert len(rows) == pytest.approx(marker.sum() / 2, rel=0.1)
+    assert rows.max() - rows.min() < 0.6 * np.ptp(np.nonzero(marker)[0])  # the upper half
+    assert (before ^ after).sum() < 0.02 * marker.sum()
+
+
 def test_an_operator_stops_the_run_and_gives_the_command_again():
     go = OperatorCommand(sequence=0, command="open", angle=1.2)
     operator = InterruptingOperator(MishapConfig(operator_stop_at=10.0, operator_go_after=3.0), go)
@@ -110,6 +161,8 @@ def test_an_operator_who_would_stop_a_run_that_is_over_says_nothing():
 
 def test_without_mishaps_the_station_has_no_system_for_them():
     station = Rig().station
+    plant = station.GetSubsystemByName("plant").plant
+    assert not any(plant.HasModelInstanceNamed(name) for name in (STAND, COVER))
     assert not {"lost_grip", "wheel_slip"} & {system.get_name() for system in station.GetSystems()}
 
 

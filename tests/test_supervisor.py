@@ -18,7 +18,7 @@ from valve_drake.supervisor.supervisor import (
     step,
 )
 from valve_drake.supervisor.supervisor_system import SupervisorSystem
-from valve_drake.task.modes import RUNNING, TABLE, TERMINAL, WATCHED
+from valve_drake.task.modes import FIXED, RUNNING, TABLE, TERMINAL, WATCHED
 
 DT = 1 / 32
 CONFIG = SupervisorConfig()
@@ -220,7 +220,9 @@ def test_every_entry_into_a_mode_is_a_new_activation():
         (Mode.MEASURE, "marker_lost", "", [Mode.FOLD, Mode.RETREAT, Mode.SEARCH], 2),
         (Mode.ROUGH_APPROACH, "marker_lost", "", [Mode.SEARCH], 2),
         (Mode.SERVO, "marker_lost", "", [Mode.REACH], 2),
-        (Mode.GRASP, "grasp_missed", "", [Mode.RELEASE, Mode.REACH], 2),
+        (Mode.GRASP, "grasp_missed", "", [Mode.RELEASE, Mode.FOLD, Mode.MEASURE, Mode.REACH], 2),
+        (Mode.REACH, "marker_lost", "moved", [Mode.FOLD, Mode.MEASURE, Mode.REACH], 2),
+        (Mode.SERVO, "marker_lost", "moved", [Mode.RELEASE, Mode.FOLD, Mode.MEASURE, Mode.REACH], 2),
     ],
 )
 def test_what_may_be_tried_again_is_tried_again_and_only_so_often(mode, verdict, cause, again, retries):
@@ -265,7 +267,28 @@ def test_a_marker_lost_on_the_way_is_searched_again(mode):
     assert (state.mode, state.verdict) == (Mode.DONE, Verdict.TURNED)
 
 
-@pytest.mark.parametrize("mode", [m for m in RUNNING if m not in WATCHED and m != Mode.SEARCH])
+@pytest.mark.parametrize("mode", FIXED)
+def test_a_valve_that_was_moved_while_the_hands_were_on_their_way_is_measured_again(mode):
+    bench = bring_to(mode)
+    lost = {"state": "failed", "verdict": "marker_lost", "cause": "moved", "detail": "100 mm"}
+    bench.tick(lambda s: {"valve_search": lost})
+    assert "100 mm" in bench.state.reason
+    assert bench.state.mode == (Mode.RELEASE if mode in CONTACT else Mode.FOLD)
+    state = bench.until_end(succeed)
+    assert bench.modes.count(Mode.MEASURE) == 2 and bench.modes.count(Mode.VERIFY) == 1
+    assert (state.mode, state.verdict) == (Mode.DONE, Verdict.TURNED)
+
+
+@pytest.mark.parametrize("times, verdict", [(1, Verdict.TURNED), (2, Verdict.UNVERIFIED)])
+def test_a_marker_that_is_not_seen_after_the_turn_is_looked_for_from_farther_back_once(times, verdict):
+    bench = Bench()
+    state = bench.until_end(fail_in(Mode.VERIFY, "unverified", cause="unseen", times=times))
+    after = bench.modes[bench.modes.index(Mode.VERIFY) :]
+    assert after[:-1] == [Mode.VERIFY, Mode.RETREAT, Mode.VERIFY, Mode.RETREAT]
+    assert state.verdict == verdict and not state.near
+
+
+@pytest.mark.parametrize("mode", [m for m in RUNNING if m not in (*WATCHED, *FIXED, Mode.SEARCH)])
 def test_elsewhere_valve_search_has_no_say(mode):
     bench = bring_to(mode)
     bench.tick(lambda s: {"valve_search": {"state": "failed", "verdict": "marker_lost"}})

@@ -12,7 +12,7 @@ from valve_drake.behaviors.valve_search import Memory, ValveSearchConfig, aim, b
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, inverse, make
-from valve_drake.messages import Mode, ModeState, RectangleEstimate, RobotState, StereoPosition, Verdict
+from valve_drake.messages import Cause, Mode, ModeState, RectangleEstimate, RobotState, StereoPosition, Verdict
 from valve_drake.ports import TICK
 from valve_drake.robot.drive import DIFFERENTIAL, drive
 
@@ -343,6 +343,40 @@ def test_gaze_does_not_follow_a_single_false_sighting_but_a_marker_that_moved():
     for k in range(1, 6):
         target = see(1.25 + k / 8, (1.5, 0, 3))
     assert np.array_equal(target, [1.5, 0, 3])
+
+
+def looked(modes, *places) -> list:
+    """The last status after an image at each place, in the modes one after the other."""
+    memory, k, out = Memory(), 0, []
+    for activation, (mode, count) in enumerate(modes):
+        for place in places[k : k + count]:
+            k += 1
+            estimate = RectangleEstimate(time=k + 0.2, found=True, X_LV=make(np.eye(3), np.array([*place, 1.0])))
+            state = ModeState(mode=mode, activation=activation)
+            inputs = (robot_state(), state, StereoPosition(), estimate, HEAD)
+            memory, _, status = step(CONFIG, memory, k + 0.1, DT, *inputs)
+        out.append(status)
+    return out
+
+
+HERE, THERE, NEAR_BY = (0.0, 0.0), (0.1, 0.0), (0.02, 0.01)
+
+
+@pytest.mark.parametrize("modes", [[("measure", 1), ("reach", 2)], [("measure", 1), ("reach", 1), ("servo", 2)]])
+def test_a_valve_that_was_moved_while_the_hands_are_on_their_way_is_noticed_by_two_looks(modes):
+    count = sum(n for _, n in modes)
+    moved = looked(modes, *[HERE] * (count - 2), THERE, THERE)[-1]
+    assert (moved.state, moved.cause) == ("failed", Cause.MOVED)
+    assert "100 mm from where it was measured" in moved.detail
+    for last in ([HERE, THERE], [THERE, HERE], [NEAR_BY, NEAR_BY], [THERE, (-0.1, 0.0)]):
+        assert looked(modes, *[HERE] * (count - 2), *last)[-1].state == "idle"
+
+
+def test_a_move_is_forgotten_by_the_next_measurement_and_none_while_the_hands_go_the_same_way():
+    again = [("measure", 1), ("reach", 2), ("fold", 1), ("measure", 1), ("reach", 2)]
+    assert looked(again, HERE, *[THERE] * 6)[-1].state == "idle"
+    way = [("measure", 1), ("reach", 1), ("servo", 1), ("grasp", 1), ("release", 1), ("reach", 2)]
+    assert looked(way, HERE, HERE, HERE, THERE, THERE, THERE, THERE)[-1].cause == Cause.MOVED
 
 
 def test_gaze_survives_a_sighting_that_is_not_finite():

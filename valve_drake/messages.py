@@ -318,6 +318,9 @@ class Cause(enum.StrEnum):
 
     NONE = ""
     STANCE = "stance"  # the arms would reach from another place
+    MOVED = "moved"  # the valve is no longer where it was measured
+    UNSEEN = "unseen"  # the camera did not see the marker
+    LOST_COUNT = "lost_count"  # tracking was lost: the valve may have turned by half a turn more, or less
     REGRASP = "regrasp"  # the hands turned the valve as far as one grasp reaches, and more is asked for
 
 

@@ -28,6 +28,7 @@ from valve_drake.frames import cross
 from valve_drake.robot.kinematics import HandLoad
 
 GRAVITY = 9.81
+BELOW_TRIP = 0.9  # of the force that ends a turn: what the hands drive with, at most
 
 
 def gravity_wrench(R_BG: np.ndarray, hand: HandLoad) -> np.ndarray:
@@ -95,12 +96,25 @@ def make_chain(p: np.ndarray, wrenches: np.ndarray, u: np.ndarray, middle: np.nd
     return Chain(p, f, m, c, u, b, t, r, h, couples, float(couples[0] + couples[1]))
 
 
-def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, extra: np.ndarray) -> np.ndarray:
+def torque_limit(chain: Chain, config: HybridRotationConfig, share: float) -> float:
+    """What the hands may put on the valve [N m]: `share` of the limit, which near the axis is that of their forces."""
+    by_force = BELOW_TRIP * config.force_trip * float(chain.r[0] + chain.r[1])
+    return share * min(config.torque_limit, by_force)
+
+
+def twists(
+    chain: Chain,
+    turn_rate: float | None,
+    config: HybridRotationConfig,
+    extra: np.ndarray,
+    limit: float | None = None,
+) -> np.ndarray:
     """Eq. (2)-(5): the twists [w; v at c] of both hands -> (2, 6).
 
     turn_rate: about u [rad/s]; None lets the hands yield in that direction too.
-    extra: added to the common twist (6,), e.g. a tug.
+    extra: added to the common twist (6,), e.g. a tug. limit: of the torque [N m]; None: the config's.
     """
+    limit = config.torque_limit if limit is None else limit
     h1, h2 = chain.h
     D = np.array([config.angular_damping] * 3 + [config.damping] * 3)
     h_a, h_r = h1 + h2, (h2 - h1) / 2
@@ -108,7 +122,7 @@ def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, 
     target = np.zeros(6)
     if turn_rate is not None:
         # Beyond the limit the target is constant, or the relative loop would build up force on a stuck valve.
-        couple = min(max(chain.torque, -config.torque_limit), config.torque_limit)
+        couple = min(max(chain.torque, -limit), limit)
         force = couple / (chain.r[0] + chain.r[1])
         V_a[3:] += force * (chain.t[0] + chain.t[1]) / (2 * D[3:])
         V_a[:3] += chain.u * (turn_rate - chain.u @ V_a[:3])
@@ -119,18 +133,27 @@ def twists(chain: Chain, turn_rate: float | None, config: HybridRotationConfig, 
     return np.array([V_a - V_r / 2, V_a + V_r / 2])
 
 
-def turn_rate(left: float, rate: float, torque: float, lead: float, config: HybridRotationConfig, dt: float) -> float:
+def turn_rate(
+    left: float,
+    rate: float,
+    torque: float,
+    lead: float,
+    config: HybridRotationConfig,
+    dt: float,
+    limit: float | None = None,
+) -> float:
     """The rate for the next tick [rad/s]. All numbers count along the sense of the turn: positive = towards the goal.
 
-    left: still to turn [rad]; rate: now; torque, lead: see the config's limits. A negative result yields to a torque
-    above its limit.
+    left: still to turn [rad]; rate: now; torque, lead: see the config's limits; limit: of the torque [N m], None: the
+    config's. A negative result yields to a torque above its limit.
     """
-    if torque > config.torque_limit:
-        return (config.torque_limit - torque) / (2 * config.angular_damping)
+    limit = config.torque_limit if limit is None else limit
+    if torque > limit:
+        return (limit - torque) / (2 * config.angular_damping)
     acceleration = config.rate / config.ramp
     brake = math.sqrt(2 * acceleration * max(left, 0.0))
     wanted = max(config.slow, min(config.rate, brake)) if left > 0 else 0.0
-    by_torque = (config.torque_limit - torque) / (0.3 * config.torque_limit)
+    by_torque = (limit - torque) / (0.3 * limit)
     by_lead = (config.lead_limit - lead) / (0.25 * config.lead_limit)
     scaled = wanted * min(max(min(by_torque, by_lead), 0.0), 1.0)
     return min(scaled, max(rate, 0.0) + acceleration * dt)

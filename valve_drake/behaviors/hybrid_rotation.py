@@ -125,6 +125,7 @@ class HybridRotation(Grasping, Turning, Releasing):
             rate=0.0,
             progress_at=(time, 0.0),
             stalls=0,
+            stiff=False,
             tripped=0,
             held_time=0.0,
             bad_grip_time=0.0,

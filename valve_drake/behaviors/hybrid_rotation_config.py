@@ -25,7 +25,10 @@ class HybridRotationConfig(Config):
     ramp: float = number(0.5, 0.05, 5.0, "time from rest to full rate, and back [s]")
     slow: float = number(0.006, 5e-4, 0.1, "least rate near the goal [rad/s]")
     torque_limit: float = number(
-        12.0, 1.0, 16.0, "on the valve; the rate falls to zero over its last 30 %; raise it for a stiff valve [N m]"
+        14.0, 1.0, 16.0, "on the valve; the rate falls to zero over its last 30 %; raise it for a stiff valve [N m]"
+    )
+    gentle: float = number(
+        0.86, 0.1, 1.0, "share of torque_limit until the turn has stalled once; 1: all of it from the beginning"
     )
     lead_limit: float = number(0.05, 0.005, 0.2, "commanded minus measured angle, at most [rad]")
     force_trip: float = number(55.0, 10.0, 55.0, "force on one hand that ends the turn [N]")

@@ -57,6 +57,7 @@ class Memory:
     progress_at: tuple[float, float] = (0.0, 0.0)  # (time, angle) of the last progress
     stalls: int = 0
     stalled_at: float = 0.0
+    stiff: bool = False  # the last stall was one in both senses, with as much force as was allowed then
     tripped: int = 0  # ticks over the force trip
     held_time: float = 0.0  # both grippers have held for so long, in grasp [s]
     bad_grip_time: float = 0.0  # an opening or the sharing of the load is no grasp's for so long, in turn [s]

@@ -6,6 +6,7 @@ import numpy as np
 
 from valve_drake.behaviors.closed_chain import (
     Chain,
+    torque_limit,
     turn_rate,
     twists,
 )
@@ -20,6 +21,8 @@ from valve_drake.messages import (
     Status,
     Verdict,
 )
+
+SAME_PLACE = np.radians(2)  # two stalls so near to each other are of one cause [rad]
 
 
 class Turning(Hands):
@@ -48,7 +51,8 @@ class Turning(Hands):
             m = changed(m, stage="there", status=status)
             return m, twists(chain, None, c, np.zeros(6)), gripper
         lead = sense * (m.commanded - m.turned)
-        rate = turn_rate(left, m.rate, sense * chain.torque, lead, c, dt)
+        limit = torque_limit(chain, c, 1.0 if m.stalls else c.gentle)
+        rate = turn_rate(left, m.rate, sense * chain.torque, lead, c, dt, limit)
         if mode.held:  # it slows down to rest; a stall is none
             rate = min(rate, max(m.rate - c.rate / c.ramp * dt, 0.0))
             m = changed(m, progress_at=(time, m.turned))
@@ -56,38 +60,39 @@ class Turning(Hands):
         progress = min(max((m.plan.turned + m.turned) / mode.turn_angle, 0.0), 1.0)
         m = changed(m, status=Status(time, m.activation, "running", progress=progress, value=m.plan.turned + m.turned))
         m = self._stall(time, m, sense, left)
-        return m, twists(chain, sense * rate, c, np.zeros(6)), gripper
+        return m, twists(chain, sense * rate, c, np.zeros(6), limit), gripper
 
     def _stall(self, time: float, m: Memory, sense: float, left: float) -> Memory:
-        """After a stall it turns the other way: if that is free, the stall was an end stop, else the valve is stuck."""
+        """After a stall it turns the other way, and then on with all the torque that is allowed: if it was free that
+        way and stalls in the same place, that is an end stop; if it stalls in both senses, the valve is stuck."""
         c: HybridRotationConfig = self.config
         since, angle = m.progress_at
         if sense * (m.turned - angle) > c.stall_angle:
             return changed(m, progress_at=(time, m.turned))
-        if m.stage == "back":
-            if left <= c.tolerance:  # free the other way: turn on
-                return changed(m, stage="turn", rate=0.0, progress_at=(time, m.turned), commanded=m.turned)
-            if time - since > c.stall_time:
-                detail = (
-                    f"stiff both ways at {np.degrees(m.plan.turned + m.turned):.1f} deg, {m.telemetry.torque:.1f} N m"
-                )
-                return self._fail(time, m, Verdict.STUCK, detail)
-        elif time - since > c.stall_time:
-            if m.stalls > 0 and abs(m.turned - m.stalled_at) < np.radians(2):
-                detail = f"stopped twice at {np.degrees(m.plan.turned + m.turned):.1f} deg, free the other way"
-                return self._fail(time, m, Verdict.END_STOP, detail)
-            if m.stalls >= 3:
-                return self._fail(time, m, Verdict.STUCK, f"stalled {m.stalls + 1} times")
-            return changed(
-                m,
-                stage="back",
-                rate=0.0,
-                stalls=m.stalls + 1,
-                stalled_at=m.turned,
-                progress_at=(time, m.turned),
-                commanded=m.turned,
-            )
-        return m
+        free = m.stage == "back" and left <= c.tolerance
+        again = m.stage == "turn" and m.stiff and abs(m.turned - m.stalled_at) < SAME_PLACE
+        if not free and time - since <= (c.stall_time / 2 if again else c.stall_time):
+            return m
+        if m.stage == "back":  # turn on, with more force than before
+            return changed(m, stage="turn", rate=0.0, progress_at=(time, m.turned), commanded=m.turned, stiff=not free)
+        here = f"{np.degrees(m.plan.turned + m.turned):.1f} deg"
+        if again:
+            detail = f"stiff both ways at {here}, {m.telemetry.torque:.1f} N m"
+            return self._fail(time, m, Verdict.STUCK, detail)
+        if m.stalls > 0 and abs(m.turned - m.stalled_at) < SAME_PLACE:
+            return self._fail(time, m, Verdict.END_STOP, f"stopped twice at {here}, free the other way")
+        if m.stalls >= 3:
+            return self._fail(time, m, Verdict.STUCK, f"stalled {m.stalls + 1} times")
+        return changed(
+            m,
+            stage="back",
+            rate=0.0,
+            stalls=m.stalls + 1,
+            stalled_at=m.turned,
+            progress_at=(time, m.turned),
+            commanded=m.turned,
+            stiff=False,
+        )
 
     def _watch(self, time: float, dt: float, m: Memory, state: RobotState, chain: Chain) -> Memory:
         """Force trip, grasp lost, one hand carrying all, end of reach."""
@@ -95,7 +100,7 @@ class Turning(Hands):
         force = [math.hypot(*f) for f in chain.f.tolist()]
         m = changed(m, tripped=m.tripped + 1 if max(force) > c.force_trip else 0)
         if m.tripped >= 3:
-            verdict = Verdict.STUCK if abs(chain.torque) > 0.7 * c.torque_limit else Verdict.FAULT
+            verdict = Verdict.STUCK if abs(chain.torque) > 0.6 * c.torque_limit else Verdict.FAULT
             return self._fail(time, m, verdict, f"hand forces {force[0]:.0f} and {force[1]:.0f} N")
         off = max(self._off(m, state)) > 2 * c.grip_margin
         share = chain.couples[0] / chain.torque if abs(chain.torque) > 2.0 else chain.share

@@ -102,7 +102,7 @@ class KinematicApproach(Looks):
     # ------------------------------------------------------------ fold
     def _fold(self, time: float, m: Memory, inputs: Inputs) -> Memory:
         if m.phase == "start":
-            m = self._status(m, time, "running")
+            m = self._status(self._shifted(time, m, inputs.estimate, inputs.turn), time, "running")
         if m.phase in ("start", "planning", "moving"):
             m = self._homing(time, m, self._valve(m, inputs.state, inputs.turn), inputs)
             if m.phase == "blocked":

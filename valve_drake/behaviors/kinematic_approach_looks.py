@@ -20,6 +20,7 @@ from valve_drake.perception.fusion import fuse
 from valve_drake.valve.valve import angle_turned
 
 STILL = 0.005  # lift and waist have not moved by more in the last second: they stand [rad, m]
+DOUBT = 0.25  # share of the angle after which the marker looks alike: camera and hands may differ by so much
 AGREE = 0.1  # camera and hands, on a turn in which nothing slipped [rad]
 
 
@@ -57,10 +58,13 @@ class Looks(Motion):
         X_BA = compose(inverse(planar(*inputs.state.odometry[:3])), X_OA)
         counted = 0.0
         if m.X_OA0 is not None:
-            counted = self.seen_angle(m.X_OA0, X_OA, fused.axis_known, self._by_hands(m, inputs.turn))
+            hands = self._by_hands(m, inputs.turn)
+            counted = self.seen_angle(m.X_OA0, X_OA, fused.axis_known, hands)
+            if lost := self._lost_count(time, m, counted, hands, fused.axis_known):
+                return lost
         first = X_OA if m.X_OA0 is None else m.X_OA0
         m = changed(m, phase="planning", X_OA0=first, X_OA=X_OA, counted=counted, covariance=fused.covariance)
-        m = changed(m, plan=GraspPlan())  # what the hands did by it is counted
+        m = changed(m, p_OV=fused.X_OV[:, 3], plan=GraspPlan())  # what the hands did by it is counted
         return self._ask(m, "grasps", X_BA, posture=inputs.state.posture, turn_angle=inputs.mode.turn_angle - counted)
 
     def _plan(self, time: float, m: Memory, grasps: GraspPlan) -> Memory:
@@ -94,12 +98,14 @@ class Looks(Motion):
         if not fused.found or m.X_OA0 is None:
             return self._status(m, time, "failed", Verdict.MARKER_LOST, fused.reason)
         X_OA = self.valve.place(fused.X_OV, fused.angle)
-        seen = self.seen_angle(m.X_OA0, X_OA, fused.axis_known, self._by_hands(m, inputs.turn))
+        hands = self._by_hands(m, inputs.turn)
+        seen = self.seen_angle(m.X_OA0, X_OA, fused.axis_known, hands)
+        if lost := self._lost_count(time, m, seen, hands, fused.axis_known):
+            return lost
         asked, tolerance = inputs.mode.turn_angle, self.config.angle_tolerance
         detail = f"camera sees {np.degrees(seen):.2f} deg of {np.degrees(asked):.2f} deg"
         if abs(asked - seen) <= tolerance:
             return changed(m, status=self._seen(time, m, "succeeded", Verdict.NONE, detail, seen))
-        hands = self._by_hands(m, inputs.turn)
         if not inputs.mode.verdict and abs(asked - hands) > tolerance and abs(hands - seen) < AGREE:
             # The turn ended as it should, where the arms reach no farther.
             status = self._seen(time, m, "failed", Verdict.REACH_LIMIT, detail, seen)
@@ -128,7 +134,8 @@ class Looks(Motion):
         hands = f"hands turned {felt:.2f} deg of {asked:.2f} deg"
         m = changed(m, phase="end")
         if drift is None or m.X_OA0 is None:
-            return self._status(m, time, "failed", Verdict.UNVERIFIED, f"camera does not see the marker, {hands}")
+            words = f"camera does not see the marker, {hands}"
+            return self._status(m, time, "failed", Verdict.UNVERIFIED, words, cause=Cause.UNSEEN)
         fused = fuse(m.looks[-1:])
         X_OA = self.valve.place(fused.X_OV, fused.angle)
         seen = self.seen_angle(m.X_OA0, X_OA, fused.axis_known, self._by_hands(m, turn))
@@ -139,6 +146,18 @@ class Looks(Motion):
     def _seen(self, time: float, m: Memory, state: str, verdict: str, detail: str, angle: float) -> Status:
         """A status with the angle that the camera saw [rad]."""
         return Status(time, m.activation, state, verdict, detail, 1.0, angle, seen=True)
+
+    def _lost_count(self, time: float, m: Memory, seen: float, hands: float, axis_known: bool) -> Memory | None:
+        """The memory of a run that has lost count of the turn; None: it has not.
+
+        Camera and hands that differ by nearly half of what the marker repeats after say nothing of which of two
+        positions that look alike it is."""
+        period = self.valve.repeats(axis_known)
+        if abs(seen - hands) <= DOUBT * period:
+            return None
+        words = f"tracking was lost: camera sees {np.degrees(seen):.1f} deg, hands turned {np.degrees(hands):.1f} deg"
+        detail = f"{words}, and the marker looks alike every {np.degrees(period):.0f} deg"
+        return self._status(changed(m, phase="end"), time, "failed", Verdict.UNVERIFIED, detail, Cause.LOST_COUNT)
 
     def seen_angle(self, X_OA0: np.ndarray, X_OA1: np.ndarray, axis_known: bool, by_hands: float) -> float:
         """The turned angle by camera [rad]. Of the angles that look alike (Valve.repeats) it is the one nearest to what

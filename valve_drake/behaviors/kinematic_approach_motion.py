@@ -8,7 +8,7 @@ import numpy as np
 
 from valve_drake.behaviors.joint_path import Path
 from valve_drake.config import Config, number
-from valve_drake.frames import compose, inverse, planar
+from valve_drake.frames import apply, compose, inverse, make, planar
 from valve_drake.memory import changed
 from valve_drake.messages import (
     Cause,
@@ -68,6 +68,7 @@ class Memory:
     request: PlanRequest = PlanRequest()  # the last one
     X_OA0: np.ndarray | None = None  # the valve before this run turned it
     X_OA: np.ndarray | None = None  # the valve as it was measured last
+    p_OV: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # the marker, as it was measured last [m]
     counted: float = 0.0  # turned in this run until then, by the camera [rad]
     plan: GraspPlan = GraspPlan()
     status: Status = Status()
@@ -85,6 +86,8 @@ class Inputs(NamedTuple):
     path: PathPlan
 
 
+MOVED = 0.03  # an estimate so far from the valve as it was measured tells of a valve that was moved [m]
+FRESH = 2.5  # if it is not older; in the modes before fold there is one every two seconds [s]
 NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms [m]
 
 
@@ -117,6 +120,18 @@ class Motion:
         since = self._by_hands(m, turn) - m.counted
         X_BA = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OA, since))
         return X_BA if np.hypot(*X_BA[:2, 3]) < NEAR else None
+
+    def _shifted(self, time: float, m: Memory, estimate: RectangleEstimate, turn: TurnState) -> Memory:
+        """The valve where the cameras have just seen it, if that is not where it was measured: somebody moved it."""
+        if m.X_OA is None or not estimate.found or time - estimate.time > FRESH:
+            return m
+        p_OV = m.p_OV
+        if not self.valve.fixed:  # a marker off the axis goes round with the valve
+            p_OV = apply(compose(turned(m.X_OA, self._by_hands(m, turn) - m.counted), inverse(m.X_OA)), p_OV)
+        shift = apply(estimate.X_OL, estimate.X_LV[:, 3]) - p_OV
+        if not MOVED < np.linalg.norm(shift) < NEAR:
+            return m
+        return changed(m, X_OA=make(m.X_OA[:, :3], m.X_OA[:, 3] + shift), p_OV=m.p_OV + shift)
 
     def _by_hands(self, m: Memory, turn: TurnState) -> float:
         """How far the valve was turned in this run: by the camera until the last plan, and since by the hands [rad]."""

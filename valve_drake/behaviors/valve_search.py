@@ -11,7 +11,8 @@ Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base w
              does, since a valve that such a robot can reach is near (`bolted`).
     others   The neck keeps the last known p_OV on the optical axis of the left camera, the waist comes back to zero;
              only while driving it helps when the neck is at its end.
-             Without a sighting for `lost_after` while driving or measuring: failed with marker_lost.
+             Without a sighting for `lost_after` while driving or measuring: failed with marker_lost. While the hands go
+             to the handles, two estimates that agree on another place than the one measured: failed with cause moved.
 
 Sightings carry the camera's pose X_OL of their capture time: p_OV = X_OL p_LV holds in motion too. Frames: frames.py.
 """
@@ -28,6 +29,7 @@ from valve_drake.config import Config, number, numbers
 from valve_drake.frames import apply, wrap
 from valve_drake.memory import changed
 from valve_drake.messages import (
+    Cause,
     Command,
     Mode,
     ModeState,
@@ -39,7 +41,7 @@ from valve_drake.messages import (
 )
 from valve_drake.motion import follow, slew, towards
 from valve_drake.robot.drive import DIFFERENTIAL, Drive
-from valve_drake.task.modes import HOLD, TABLE, WATCHED
+from valve_drake.task.modes import FIXED, HOLD, TABLE, WATCHED
 
 HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading) in O, torso (3,) -> X_OL (3, 4)
 
@@ -65,6 +67,9 @@ class ValveSearchConfig(Config):
     ahead: float = number(0.4, 0.05, 1.0, "the gaze waits for images when it is so far ahead of the last one's [rad]")
     skip_time: float = number(0.5, 0.05, 10.0, "then images are ignored while the sweep moves on [s]")
     lost_after: float = number(2.0, 0.2, 30.0, "without a sighting while driving or measuring [s]")
+    moved_by: float = number(
+        0.04, 0.01, 0.5, "a valve so far from where it was measured was moved; less than that the hands make up for [m]"
+    )
     jump: float = number(
         0.5, 0.05, 5.0, "a sighting this far from the last is believed only when the old place is empty [m]"
     )
@@ -135,6 +140,7 @@ class Memory:
     result: str = "running"  # running | succeeded | failed
     verdict: str = Verdict.NONE.value
     detail: str = ""
+    cause: str = Cause.NONE.value
     # torso
     started: bool = False  # the torso has been measured: its command starts there
     torso: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))  # command [rad]
@@ -146,6 +152,10 @@ class Memory:
     aside: np.ndarray | None = None  # where it looks, off the target, in O [m]; None: at it
     target_time: float = -np.inf  # its capture time [s]
     capture_time: float = -np.inf  # of the newest sighting looked at [s]
+    estimate_time: float = -np.inf  # capture time of the newest pose of the marker [s]
+    estimated: np.ndarray | None = None  # p_OV by it [m]
+    measured: np.ndarray | None = None  # p_OV when the hands set out for the handles [m]
+    elsewhere: np.ndarray | None = None  # p_OV of the last pose, if it is far from there [m]
     # search
     sweeps: int = -1  # completed across; -1: on the way to the first end
     side: float = 1.0  # the end it is moving to
@@ -218,6 +228,7 @@ def step(
         twist = None if drive.fixed else drive.part(np.array([0.0, 0.0, m.turn_rate]))
     else:
         m = _sight(config, m, position, estimate)
+        m = _place(config, m, estimate, mode.mode in FIXED and m.result == "running")
         if mode.mode in WATCHED and m.result == "running":
             blind = time - max(m.since, m.target_time)
             if blind > config.lost_after:
@@ -249,12 +260,22 @@ def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
         aside=m.aside,
         target_time=m.target_time,
         capture_time=m.capture_time,
+        estimate_time=m.estimate_time,
+        estimated=m.estimated,
+        measured=_measured(m, mode),
         side=1.0 if gaze >= 0 else -1.0,  # the nearer end first
         gaze=gaze,
         heading=float(base[2]),
         seen_time=time,
         seen_azimuth=float(base[2]) + gaze,
     )
+
+
+def _measured(m: Memory, mode: ModeState) -> np.ndarray | None:
+    """Where the marker was when the hands set out, for as long as they follow that measurement."""
+    if mode.mode == Mode.SEARCH or mode.mode in WATCHED:
+        return None
+    return m.estimated if m.measured is None and mode.mode in FIXED else m.measured
 
 
 def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") -> Memory:
@@ -275,12 +296,12 @@ def _sweeps(drive: Drive) -> int:
 
 
 def _status(config: ValveSearchConfig, m: Memory, time: float, mode: ModeState, sweeps: int) -> Status:
-    if mode.mode != Mode.SEARCH and mode.mode not in WATCHED:
+    if mode.mode != Mode.SEARCH and mode.mode not in WATCHED and m.result == "running":
         return Status(time=time, activation=mode.activation)
     progress = 0.0
     if mode.mode == Mode.SEARCH:
         progress = 1.0 if m.result == "succeeded" else max(m.sweeps, 0) / (sweeps * len(config.pitches))
-    return Status(time, mode.activation, m.result, m.verdict, m.detail, progress)
+    return Status(time, mode.activation, m.result, m.verdict, m.detail, progress, cause=m.cause)
 
 
 # ---------------------------------------------------------------- gaze
@@ -304,6 +325,27 @@ def _sight(config: ValveSearchConfig, m: Memory, position: StereoPosition, estim
     if far and time - m.target_time < config.jump_after:
         return m
     return changed(m, target=p_OV, target_time=time)
+
+
+def _place(config: ValveSearchConfig, m: Memory, estimate: RectangleEstimate, judge: bool) -> Memory:
+    """Takes a new pose of the marker; judge: whether it ends the mode if the valve is not where it was measured.
+
+    Stage 1 has no say in this: the middle of a marker that an arm covers in part is not its middle."""
+    if not estimate.found or estimate.time <= m.estimate_time:
+        return m
+    p_OV = apply(estimate.X_OL, estimate.X_LV[:, 3])
+    if not np.all(np.isfinite(p_OV)):
+        return m
+    m = changed(m, estimate_time=estimate.time, estimated=p_OV)
+    if not judge or m.measured is None or estimate.time <= m.since:
+        return m
+    off = float(np.linalg.norm(p_OV - m.measured))
+    if off < config.moved_by:
+        return changed(m, elsewhere=None)
+    if m.elsewhere is None or np.linalg.norm(p_OV - m.elsewhere) > config.moved_by / 2:
+        return changed(m, elsewhere=p_OV)
+    words = f"marker {1e3 * off:.0f} mm from where it was measured"
+    return changed(_end(m, "failed", Verdict.MARKER_LOST, words), cause=Cause.MOVED.value)
 
 
 def _gaze(

@@ -28,6 +28,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from valve_drake import profiling
 from valve_drake.beside import Beside
+from valve_drake.frames import inverse
 from valve_drake.messages import SIDES
 from valve_drake.ports import SLOT, TICK, PythonSystem
 from valve_drake.robot.drive import whole
@@ -35,6 +36,7 @@ from valve_drake.robot.groups import GROUPS
 from valve_drake.robot.robot import Robot
 from valve_drake.stations import contacts
 from valve_drake.stations.contract import CONTRACT, vectors
+from valve_drake.stations.rails import rails
 from valve_drake.stations.scene import add_scene
 from valve_drake.stations.servos import add_servos, ignore_touching
 from valve_drake.stations.simulation_config import ValveConfig
@@ -125,6 +127,9 @@ class PlantSystem(PythonSystem):
         still = builder.AddNamedSystem("valve_at_rest", ConstantVectorSource(np.zeros(2)))
         builder.Connect(still.get_output_port(), self.plant.get_desired_state_input_port(self.valve))
         builder.ExportInput(self.plant.get_desired_state_input_port(self.robot), "desired")
+        self.rails = rails(self.plant, valve, shape)
+        for rail in self.rails:
+            builder.ExportInput(self.plant.get_desired_state_input_port(rail.model), rail.joint)
         builder.ExportInput(self.plant.get_actuation_input_port(self.robot), "feed_forward")
         self.diagram: Diagram = builder.Build()
         self.diagram.set_name("plant_with_servos")
@@ -152,6 +157,10 @@ class PlantSystem(PythonSystem):
         desired = np.zeros(2 * len(joints))  # [q_d; v_d] of the robot's actuators
         self._fixed_desired, self._desired = self._fix("desired", desired)
         self._fixed_feed_forward, self._feed_forward = self._fix("feed_forward", np.zeros(len(joints)))
+        self._driven_rails = [(rail, *self._fix(rail.joint, np.zeros(2))) for rail in self.rails]
+        self._rails_at = [self.plant.GetJointByName(rail.joint).position_start() for rail in self.rails]
+        self._axis = (self.plant.GetFrameByName("valve_axis", self.valve), inverse(shape.X_AP())[:, 3])
+        self._hands = [self.plant.GetFrameByName(f"{side}_grip", self.robot) for side in SIDES]
         self._net_actuation = self.plant.get_net_actuation_output_port(self.robot)
         self._reaction_forces = self.plant.get_reaction_forces_output_port()
         self._contact_results = self.plant.get_contact_results_output_port()
@@ -197,6 +206,8 @@ class PlantSystem(PythonSystem):
         self._set_fingers(desired, x, self._grips(x, commands))
         self.diagram.GetInputPort("desired").FixValue(inner, desired)
         self.diagram.GetInputPort("feed_forward").FixValue(inner, self._gravity(plant_context))
+        for rail, goal in zip(self.rails, self._rail_goals(plant_context, x)):
+            self.diagram.GetInputPort(rail.joint).FixValue(inner, goal)
         return plant_context
 
     def _fix(self, name: str, value: np.ndarray) -> tuple[FixedInputPortValue, np.ndarray]:
@@ -245,6 +256,15 @@ class PlantSystem(PythonSystem):
         n = len(self.actuated)
         for at, q, v in zip(self._base_at, pose, speed):
             desired[at], desired[n + at] = q, v
+
+    def _rail_goals(self, plant_context: Context, x: np.ndarray) -> list[tuple[float, float]]:
+        """Where each rail is sent in the next step, and how fast; x: of the plant, now."""
+        if not self.rails:
+            return []
+        frame, p_axis = self._axis
+        places = [self.plant.CalcPointsPositions(plant_context, hand, np.zeros(3), frame) for hand in self._hands]
+        distance = min(float(np.linalg.norm(place.ravel() - p_axis)) for place in places)
+        return [r.desired(float(x[at]), distance, TICK / STEPS) for r, at in zip(self.rails, self._rails_at)]
 
     def _set_friction(self, x: np.ndarray) -> None:
         """Of a valve that stiffens while it opens."""
@@ -318,6 +338,9 @@ class PlantSystem(PythonSystem):
                 self._set_joints(desired, commands)
             self._set_base(desired, start, twist, k * TICK / STEPS)
             self._set_fingers(desired, x, grips)
+            for (_, fixed, kept), goal in zip(self._driven_rails, self._rail_goals(self._inner, x)):
+                fixed.GetMutableData()
+                kept[:] = goal
             after = self.diagram.EvalUniquePeriodicDiscreteUpdate(scratch)
             x = after.value(0)
             if k < STEPS - 1:

@@ -5,7 +5,6 @@ import dataclasses as dc
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
@@ -13,6 +12,7 @@ from valve_drake import resources
 from valve_drake.frames import make, rot_x, rot_y, rot_z
 from valve_drake.robot import description, model
 from valve_drake.robot.description import RobotDescription
+from valve_drake.stations.rails import add_cover, add_stand
 from valve_drake.stations.simulation_config import StartConfig, ValveConfig
 from valve_drake.valve.model import add_valve
 from valve_drake.valve.valve import Valve
@@ -80,11 +80,9 @@ def add_scene(
     robot_model = add_robot(plant, robot, place)
     valve_model = add_valve(plant, shape, _marker_offset(valve, shape.marker.size))
     X_WP = panel_pose(valve)
-    plant.WeldFrames(  # mounts the panel in the room
-        plant.world_frame(),
-        plant.GetFrameByName("valve_axis", valve_model),
-        RigidTransform(RotationMatrix(X_WP[:, :3]), X_WP[:, 3]),
-    )
+    frame, X_FP = add_stand(plant, valve, X_WP)
+    plant.WeldFrames(frame, plant.GetFrameByName("valve_axis", valve_model), X_FP)  # mounts the panel in the room
+    add_cover(plant, valve, shape, X_WP)
     if laboratory and (resources.models() / "laboratory" / "laboratory.sdf").is_file():
         parse(plant, "laboratory")
     stem = plant.GetJointByName("stem", valve_model)

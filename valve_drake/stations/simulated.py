@@ -36,6 +36,7 @@ from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, TRUTH, WRISTS, check_contract
 from valve_drake.stations.mishaps import LostGripSystem, WheelSlipSystem, slips
 from valve_drake.stations.plant_system import COMMANDS, STEM, PlantSystem
+from valve_drake.stations.rails import STAND
 from valve_drake.stations.scene import add_scene, panel_pose, start_pose
 from valve_drake.stations.simulation_config import ErrorConfig, MishapConfig, SimulationConfig, ValveConfig
 from valve_drake.stations.torque_wrench import add_torque_wrenches
@@ -202,6 +203,7 @@ class TruthSystem(PythonSystem):
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         self._load = self.DeclareVectorInputPort("stem_load", 6)
         stem = plant.GetJointByName("stem", physics.valve)
+        self._stand = [plant.GetJointByName(r.joint).position_start() for r in physics.rails if r.joint == STAND]
         self._q, self._v = stem.position_start(), plant.num_positions() + stem.velocity_start()
         self._base = [plant.GetJointByName(j, physics.robot).position_start() for j in physics.base]
         self._place = physics.place
@@ -224,8 +226,9 @@ class TruthSystem(PythonSystem):
         output.SetFromVector(self._state.Eval(context)[self._base] if self._base else self._place)
 
     def _calc_marker_pose(self, context: Context, output: BasicVector) -> None:
-        angle = self._state.Eval(context)[self._q] if self._turns else 0.0
-        turn = make(rotation(np.array([0, 0, -angle])), np.zeros(3))
+        state = self._state.Eval(context)
+        aside = np.array([state[self._stand].sum(), 0.0, 0.0])  # by which the stand was pushed
+        turn = make(rotation(np.array([0, 0, -state[self._q] if self._turns else 0.0])), aside)
         output.SetFromVector(compose(self._X_WP, turn, self._X_LinkMarker).ravel())
 
     def _calc_stem_wrench(self, context: Context, output: BasicVector) -> None:

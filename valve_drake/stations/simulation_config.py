@@ -32,6 +32,15 @@ class ValveConfig(Config):
         -1.0, -1.0, 20.0, "opened so far at the start; -1: where the command has its work to do [rad]"
     )
     seized: bool = plain(False, "does not turn at all")
+    pushed_at: Number = number(
+        -1.0, -1.0, 8.0, "its stand is pushed aside once a hand is so near its axis; -1: never [m]"
+    )
+    pushed_by: Number = number(0.1, -0.3, 0.3, "so far; positive to the right as the robot sees it [m]")
+    pushed_after: Number = number(0.0, 0.0, 60.0, "later by so long, in which it creeps by 4 mm [s]")
+    covered_at: Number = number(
+        -1.0, -1.0, 8.0, "the upper half of its marker is covered once a hand is so near its axis; -1: never [m]"
+    )
+    covered_for: Number = number(5.0, 0.1, 600.0, "for so long [s]")
     marker_place: list[float] = numbers(
         [0.0, 0.0], -0.05, 0.05, "where the marker really is, off its place along x and y of V [m]"
     )

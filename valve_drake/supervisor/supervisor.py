@@ -41,7 +41,7 @@ from valve_drake.messages import (
     Status,
     Verdict,
 )
-from valve_drake.task.modes import DEADLINES, HEAD_EVERY, MODES, RETRIES, TABLE, TERMINAL, WATCHED, WRIST_EVERY
+from valve_drake.task.modes import DEADLINES, FIXED, HEAD_EVERY, MODES, RETRIES, TABLE, TERMINAL, WATCHED, WRIST_EVERY
 
 HOLDS = tuple(mode for mode, row in TABLE.items() if row.owner == "hybrid_rotation" and not row.ending)
 
@@ -167,7 +167,12 @@ def step(
         if status.state == "failed":
             return _fail(config, s, time, owner, status)
     watch = statuses.get("valve_search")
-    if s.mode in WATCHED and watch is not None and watch.activation == s.activation and watch.state == "failed":
+    if (
+        (s.mode in WATCHED or s.mode in FIXED)
+        and watch is not None
+        and watch.activation == s.activation
+        and watch.state == "failed"
+    ):
         return _fail(config, s, time, "valve_search", watch)
     if s.held:
         return s
@@ -279,8 +284,11 @@ def _succeed(s: State, time: float, status: Status) -> State:
         back = s.mode == Mode.FOLD
         return _enter(s, time, Mode.RETREAT if back else Mode.SEARCH, reason, clearing=back, near=back)
     if s.mode == Mode.FOLD:
-        nothing_turned = Mode.TURN not in s.entered  # then there is nothing to verify
-        return _enter(s, time, Mode.RETREAT if nothing_turned else Mode.VERIFY, reason)
+        if Mode.TURN in s.entered:
+            return _enter(s, time, Mode.VERIFY, reason)
+        return _enter(s, time, Mode.RETREAT if s.verdict else Mode.MEASURE, reason)  # there is nothing to verify
+    if s.mode == Mode.RETREAT and not s.verdict:
+        return _enter(s, time, Mode.VERIFY, reason, near=False)
     if s.mode == Mode.RETREAT:
         return _enter(s, time, Mode.DONE if s.verdict == Verdict.TURNED else Mode.FAILED, s.reason, near=False)
     turned = {"verdict": Verdict.TURNED} if s.mode == Mode.VERIFY else {}

@@ -6,7 +6,8 @@ is `document()`; a test keeps it current.
     idle -(open, close)-> search -> rough_approach -> fine_approach -> measure -> reach -> servo -> grasp -> turn
          -> release -> fold -> verify -> retreat -> done
 
-A turn that is longer than one grasp reaches goes back from verify to measure.
+A turn that is longer than one grasp reaches goes back from verify to measure; so does fold if nothing is turned yet and
+the run is not failing. A retreat before the camera has decided goes back to verify.
 """
 
 import dataclasses as dc
@@ -46,6 +47,7 @@ class Row:
     deadline: default of supervisor.deadline [s]; infinite: it has none.
     contact: the hands are at the handles; a fault or a stop lets go of the valve first.
     watched: valve_search may end it because the marker is lost.
+    fixed: valve_search may end it because the valve is no longer where it was measured.
     ending: on the way off the valve; the run's own deadline does not cut it short.
     final: the run is over.
     head_every, wrist_every: perception looks at every n-th image of the head's or of the wrists' cameras; 0: at none.
@@ -66,6 +68,7 @@ class Row:
     deadline: float = math.inf
     contact: bool = False
     watched: bool = False
+    fixed: bool = False
     ending: bool = False
     final: bool = False
     head_every: int = 0
@@ -146,8 +149,10 @@ ROWS = (
         hands="kinematic_approach",
         next=Mode.SERVO,
         deadline=20.0,
-        head_every=16,  # for the log
+        fixed=True,
+        head_every=8,  # a valve that was moved is noticed within two seconds
         wrist_every=4,
+        retry={Cause.MOVED: Retry("moved", 2, Mode.FOLD)},
         off=Mode.FOLD,
     ),
     Row(
@@ -158,9 +163,13 @@ ROWS = (
         next=Mode.GRASP,
         deadline=20.0,
         contact=True,
-        head_every=16,
+        fixed=True,
+        head_every=8,
         wrist_every=1,
-        retry={ANY: Retry("servo", 2, Mode.REACH)},
+        retry={
+            Cause.MOVED: Retry("moved", 2, Mode.RELEASE, after_release=Mode.FOLD),
+            ANY: Retry("servo", 2, Mode.REACH),
+        },
         off=Mode.RELEASE,
     ),
     Row(
@@ -173,7 +182,8 @@ ROWS = (
         contact=True,
         head_every=16,
         wrist_every=16,
-        retry={Verdict.GRASP_MISSED: Retry("grasp", 2, Mode.RELEASE, after_release=Mode.REACH)},
+        # the handle is not where it was measured, or the mark is not where the handle is: the head looks again
+        retry={Verdict.GRASP_MISSED: Retry("grasp", 2, Mode.RELEASE, after_release=Mode.FOLD)},
         off=Mode.RELEASE,
     ),
     Row(
@@ -219,7 +229,10 @@ ROWS = (
         deadline=12.0,
         ending=True,
         head_every=2,
-        retry={Cause.REGRASP: Retry("regrasp", 12, Mode.MEASURE)},
+        retry={
+            Cause.REGRASP: Retry("regrasp", 12, Mode.MEASURE),
+            Cause.UNSEEN: Retry("unseen", 1, Mode.RETREAT),  # and looks from there
+        },
         off=Mode.RETREAT,
     ),
     Row(
@@ -275,6 +288,7 @@ TABLE: Mapping[Mode, Row] = types.MappingProxyType(checked(ROWS))
 
 TERMINAL = tuple(mode for mode, row in TABLE.items() if row.final)
 RUNNING = tuple(mode for mode, row in TABLE.items() if row.owner)
+FIXED = tuple(mode for mode, row in TABLE.items() if row.fixed)
 WATCHED = tuple(mode for mode, row in TABLE.items() if row.watched)
 DEADLINES = {mode.value: TABLE[mode].deadline for mode in RUNNING}  # [s]
 MODES = tuple(mode.value for mode in Mode)
