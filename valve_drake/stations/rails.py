@@ -36,6 +36,7 @@ EFFORT = 150.0  # of a rail's servo [N]
 STIFFNESS, DAMPING = 2e6, 2e4  # of it [N/m, N s/m]
 BEGUN = 1e-3  # [m]
 CREEP = 0.004  # a body moves so far while it stays [m]
+THERE = 1e-5  # so near to a place a rail is there [m]
 BEFORE = 0.015  # the cover is so far before the marker [m]
 CLOTH = (0.45, 0.42, 0.36, 1.0)
 
@@ -58,7 +59,7 @@ class Rail:
         if done < BEGUN and distance > self.near:
             return 0.0, 0.0
         speed, stop = SPEED, whole
-        if done < self.stay:
+        if done < self.stay - THERE:
             stop = min(whole, self.stay)
         elif done < self.stay + CREEP:
             speed = min(CREEP / self.stay_for, SPEED) if self.stay_for else SPEED
@@ -99,7 +100,7 @@ def rails(plant: MultibodyPlant, valve: ValveConfig, shape: Valve) -> tuple[Rail
         out.append(Rail(model, COVER, valve.covered_at, 2.5 * way, way, valve.covered_for))
     if valve.pushed_at >= 0:
         model = plant.GetModelInstanceByName(STAND)
-        out.append(Rail(model, STAND, valve.pushed_at, valve.pushed_by, BEGUN, valve.pushed_after))
+        out.append(Rail(model, STAND, valve.pushed_at, valve.pushed_by, 2 * BEGUN, valve.pushed_after))
     return tuple(out)
 
 
