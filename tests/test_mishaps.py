@@ -98,8 +98,8 @@ PUSHED, COVERED = "simulation.valve.pushed", "simulation.valve.covered"
 def test_a_valves_stand_is_pushed_aside_once_a_hand_is_near_and_stays_there(by):
     rig = Rig([f"{PUSHED}_at=2.0", f"{PUSHED}_by={by}", "simulation.valve.yaw=0.0"])
     before = rig.read("truth.marker_pose").reshape(3, 4)
-    places = [rig.run(time).read("truth.marker_pose").reshape(3, 4) for time in (0.2, 0.6, 1.0)]
-    assert np.linalg.norm(places[0][:, 3] - before[:, 3]) == pytest.approx(0.25 * 0.2, abs=0.01)  # it takes its time
+    places = [rig.run(time).read("truth.marker_pose").reshape(3, 4) for time in (0.2, 1.0, 1.3)]
+    assert 0.01 < np.linalg.norm(places[0][:, 3] - before[:, 3]) < 0.055  # it takes its time
     for place in places[1:]:
         assert place[:, 3] - before[:, 3] == pytest.approx([0, -by, 0], abs=1e-4)
         assert place[:, :3] == pytest.approx(before[:, :3], abs=1e-4)
