@@ -338,7 +338,9 @@ def _fine(
         m = changed(m, stance=m.stance.add(stance.time, stance.base, config.sightings), posture=stance.posture)
     if not (_sure(config, m.panel) and _sure(config, m.stance)):
         if time - m.since > config.stance_patience:
-            return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
+            known = f"no stance was found in {config.stance_patience:g} s" if m.panel.places else ""
+            why = stance.reason or known or "no stance: the marker's pose is not known"
+            return _end(m, "failed", Verdict.REACH_LIMIT, why)
         return changed(m, detail="waiting for a stance"), STILL
     goal, panel = m.stance.median, m.panel.median
     if np.isnan(panel[2]):  # an upright axis: a plane behind its post, facing the stance
