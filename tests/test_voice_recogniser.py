@@ -148,6 +148,23 @@ def test_other_words_in_a_sentence_refuse_it(said):
     assert all(each.score < SURE for each in sentences(said))
 
 
+def test_a_sentence_is_weighed_against_the_others_of_the_grammar_and_less_against_other_speech():
+    p = spikes("robot open the valve", sure=0.4)
+    asked = mut.Sentences.of(["robot open", "robot close"])
+    alone = mut.best_sentence(p, asked)[1]
+    assert alone < mut.best_sentence(p, asked, foreign=0.1)[1] < 1.0
+    either = silence(4)
+    either[2, [INDEX["open"], INDEX["close"], BLANK]] = 0.5, 0.4, 0.1
+    either[1, [INDEX["robot"], BLANK]] = 1.0, 0.0
+    assert mut.best_sentence(either, asked, foreign=0.0)[1] == pytest.approx(0.5 / 0.9)
+    assert mut.best_sentence(silence(3), asked, foreign=0.0) == ("robot open", 0.0)
+
+
+def test_the_wake_phrase_alone_must_be_surer_than_a_whole_sentence():
+    assert sentences("robot", sure=0.97)[0].score >= SURE > sentences("robot", sure=0.9)[0].score
+    assert sentences("robot status", sure=0.9)[0].score >= SURE
+
+
 def test_a_refused_sentence_says_what_was_heard():
     assert [each.text for each in sentences("robot open the ...")] == ["robot open the ..."]
     assert sentences("... ...") == [], "speech without a word of ours is nothing"

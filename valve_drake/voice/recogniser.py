@@ -6,8 +6,9 @@
 A word's probability is a short spike near its end; all other time is BLANK, and words that are not ours are OTHER. So
 the probability that a stretch of sound is one sentence and nothing else is a sum over all places of its spikes (the
 forward recursion of connectionist temporal classification). A sentence counts for what it is within all that could
-have been said, not for what it is beside the other sentences of the grammar: speech that was not meant for the robot
-is refused by that. `stop` does not wait for the end of a sentence, nor for its beginning; `confirm` not for the end.
+have been said, not only for what it is beside the other sentences of the grammar: speech that was not meant for the
+robot is refused by that. `stop` does not wait for the end of a sentence, nor for its beginning; `confirm` not for the
+end.
 """
 
 import dataclasses as dc
@@ -32,7 +33,10 @@ FILLERS = ("the", "by", "please", "now", "and", "way")
 PAUSE = 10  # steps without a word that end a sentence: 0.8 s; raise it for speakers who halt between words
 LONGEST = 100  # steps of a sentence: 8 s
 STOP_SURE = 0.5  # probability from which `stop` is heard; lower: fewer are missed, more are heard in other words
-SENTENCE_SURE = 0.2  # of a whole sentence; lower: fewer are refused, more other speech is taken for one
+CONFIRM_SURE = 0.2  # of `confirm`; lower: fewer are missed, more other words confirm a move that was read back
+SENTENCE_SURE = 0.5  # of a meaning, within the grammar and FOREIGN; lower: fewer are refused, more are confused
+WAKE_SURE = 0.95  # of the wake phrase alone, against all other speech; lower: other speech is listened to more often
+FOREIGN = 0.07  # weight of all that is no sentence of the grammar; higher: less other speech is taken for one
 DEAF = 6  # steps after a `stop` or `confirm` in which the same word is not heard again
 _EARLY = 0.1  # probability of `confirm` from which it is asked whether the sentence is no more than that
 
@@ -184,13 +188,18 @@ def sentence_probabilities(p: np.ndarray, sentences: Sentences) -> np.ndarray:
     return a[rows, last] + a[rows, last - 1]
 
 
-def best_sentence(p: np.ndarray, sentences: Sentences) -> tuple[str, float]:
-    """The likeliest meaning's likeliest sentence, and the meaning's probability."""
+def best_sentence(p: np.ndarray, sentences: Sentences, foreign: float = 1.0) -> tuple[str, float]:
+    """The likeliest meaning's likeliest sentence, and the meaning's probability.
+
+    foreign: the weight of all that is none of these sentences. 1: as often as the network was taught.
+    """
     each = sentence_probabilities(p, sentences)
     of_meaning = np.bincount(sentences.meanings, each)
     meaning = int(of_meaning.argmax())
     best = int(np.where(sentences.meanings == meaning, each, -1.0).argmax())
-    return sentences.texts[best], float(min(of_meaning[meaning], 1.0))
+    all_of_them = min(float(each.sum()), 1.0)
+    weight = all_of_them + foreign * (1.0 - all_of_them)
+    return sentences.texts[best], min(float(of_meaning[meaning]) / weight, 1.0) if weight > 0 else 0.0
 
 
 def transcript(p: np.ndarray) -> str:
@@ -259,16 +268,18 @@ def step(m: Memory, p: np.ndarray) -> tuple[Memory, tuple[Heard, ...]]:
         said, quiet, deaf_stop, p = (), 0, DEAF, _without(p, ["stop"])
     elif spike("confirm") > _EARLY and said:
         text, probability = best_sentence(np.stack(said), _confirms())
-        if probability >= SENTENCE_SURE:
-            out.append(Heard(text, score(probability, SENTENCE_SURE), begin, time * STEP))
+        if probability >= CONFIRM_SURE:
+            out.append(Heard(text, score(probability, CONFIRM_SURE), begin, time * STEP))
             said, quiet, deaf_confirm, p = (), 0, DEAF, _without(p, ["confirm"])
     if said and (quiet >= PAUSE or len(said) >= LONGEST):
         words = np.stack(said)
         heard = transcript(words)
         if heard.strip(". "):
-            text, probability = best_sentence(words, whole_grammar())
-            sure = probability >= SENTENCE_SURE
-            out.append(Heard(text if sure else heard, score(probability, SENTENCE_SURE), begin, end))
+            text, probability = best_sentence(words, whole_grammar(), FOREIGN)
+            needed = SENTENCE_SURE
+            if text == grammar.WAKE:  # alone, it opens the ear to all that follows
+                probability, needed = best_sentence(words, whole_grammar())[1], WAKE_SURE
+            out.append(Heard(text if probability >= needed else heard, score(probability, needed), begin, end))
         said, quiet = (), 0
     return Memory(time, said, quiet, p, (deaf_stop, deaf_confirm)), tuple(out)
 

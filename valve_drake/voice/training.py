@@ -340,11 +340,16 @@ def main() -> None:
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--fit", type=Path, metavar="FILE", help="where the network goes")
     p.add_argument("--epochs", type=int, default=14)
+    p.add_argument("--check", type=Path, metavar="FILE", help="a network to try, with voices for choosing thresholds")
     options = p.parse_args()
     if options.count:
         collect(options.folder, options.count, options.seed)
     if options.fit is not None:
         weighted(fit(load(options.folder), options.epochs, options.seed)).save(options.fit)
+    if options.check is not None:
+        from valve_drake.voice import experiment
+
+        experiment.choose(experiment.Ear(WordNet.load(options.check)), 20, print)
 
 
 if __name__ == "__main__":
