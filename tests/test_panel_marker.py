@@ -111,6 +111,17 @@ def test_the_axis_turns_by_the_marks_angle_and_looks_are_fused_so():
     assert fuse([dc.replace(one, angle=5.0, angle_seen=False)]).angle == 0.0
 
 
+def test_a_spot_that_is_no_mark_does_not_turn_the_axes_of_a_marker_that_stands_still():
+    shape, X = valve(), facing(1.3, 0.1, 0.35, 0.0, 0.0, -0.12)
+    marker, edges = shape.target(), edge_points(X, HEAD, shape.target(), 0.05)
+    aside = frames.compose(X, frames.make(frames.rot_z(np.pi / 2), np.zeros(3)), shape.X_VA())  # as if it were turned
+    P = frames.apply(aside, np.array([[0.15, 0.0, -0.013]]))
+    spot = dc.replace(edges, left=dc.replace(edges.left, green=P[:, :2] / P[:, 2:]))
+    assert estimate(spot, HEAD, marker, CONFIG).X_LV[:, 0] @ X[:, 0] < 0.1
+    found = estimate(spot, HEAD, marker, CONFIG, Track(X, axis_known=True))
+    assert found.axis_known and found.X_LV == pytest.approx(X, abs=1e-6)
+
+
 def test_the_head_looks_between_marker_and_axis():
     look = valve().look()
     assert np.linalg.norm(look) == pytest.approx(0.11) and look / 0.11 == pytest.approx(

@@ -151,6 +151,8 @@ def settle_axis(
     swapped, known = None, True
     model = marker.corners()[COUNTED_FROM[turn + 1]]
     votes = _mark_votes(views, fits[0].R, fits[0].p, marker)
+    if marker.X_VA is not None and track is not None and track.axis_known:
+        votes = [0, 0, 0, 0]  # it stands still: hands before the marks cannot tell otherwise
     if votes[0] + votes[2] != votes[1] + votes[3]:
         quarter = int(_along_y(votes))
     elif marker.aspect() > 1 + config.square_tolerance:

@@ -73,7 +73,8 @@ class RectangleEstimatorSystem(Block[RectangleEstimatorInputs, _Memory]):
             return memory, {}
         X_OL = self._head_pose(*inputs.robot_state.head_at(edges.time))
         track = None
-        if memory.X_OV is not None and edges.time - memory.time <= self._config.track_timeout:
+        still = self._marker.X_VA is not None and memory.axis_known  # a marker on the panel does not turn unseen
+        if memory.X_OV is not None and (still or edges.time - memory.time <= self._config.track_timeout):
             track = Track(frames.compose(frames.inverse(X_OL), memory.X_OV), memory.axis_known, memory.angle)
         result = dc.replace(estimate(edges, self._head, self._marker, self._config, track), X_OL=X_OL)
         memory = dc.replace(memory, sequence=edges.sequence)
