@@ -124,7 +124,7 @@ def test_a_spot_that_is_no_mark_does_not_turn_the_axes_of_a_marker_that_stands_s
 
 def test_the_head_looks_between_marker_and_axis():
     look = valve().look()
-    assert np.linalg.norm(look) == pytest.approx(0.11) and look / 0.11 == pytest.approx(
+    assert np.linalg.norm(look) == pytest.approx(0.12) and look / 0.12 == pytest.approx(
         np.array([0.0, 0.225, -0.085]) / math.hypot(0.225, 0.085)
     )
     assert Valve().look() is None

@@ -23,7 +23,7 @@ OPENING = {"counter_clockwise": 1.0, "clockwise": -1.0}  # sense that opens -> i
 # At a stance the head's cameras see about 0.35 m from top to bottom, and the handles lower than they are, from above: a
 # marker on the panel is whole in view, and so are marks about an axis as far from it as FARTHEST.
 FARTHEST = 0.235  # of such a marker from the axis [m]
-LOOK = 0.11  # from such a marker's middle towards the axis, where the head looks [m]
+LOOK = 0.12  # from such a marker's middle towards the axis, where the head looks [m]
 ALIKE = 0.02  # handles that differ by less look the same to the head's cameras [m]
 _UPRIGHT = 0.35  # horizontal part of an axis' direction below which it has no heading of its own
 
