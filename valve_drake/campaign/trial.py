@@ -4,7 +4,6 @@ A record is a plain JSON object. What depends on the machine stands in its `time
 scenario and seed are equal but for that.
 """
 
-import ctypes
 import dataclasses as dc
 import json
 import os
@@ -22,8 +21,14 @@ Record: TypeAlias = dict[str, Any]
 PROGRAM = (sys.executable, "-m", "valve_drake")
 # Outcomes beside those of a run: its process died, did not end, or it ended at its time limit.
 CRASHED, TIMED_OUT, UNFINISHED = "crashed", "timed_out", "unfinished"
-_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
-_LIBC = ctypes.CDLL(None)
+# What a run's process does before it becomes the program: if this one is killed, so is the run, and a resumed campaign
+# does not find it still writing. By itself, since nothing but exec is safe in the copy of a process that has threads.
+_TIED = """
+import ctypes, os, signal, sys
+ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG, which exec keeps
+if os.getppid() == int(sys.argv[1]):  # else it is dead already
+    os.execv(sys.argv[2], sys.argv[2:])
+"""
 _running: "set[subprocess.Popen[bytes]]" = set()  # in this process
 # Taken over from `run --json` as they are; those of `_TIMES` depend on the machine.
 _FIGURES = tuple(figures(Summary()))
@@ -55,7 +60,7 @@ class Trial:
 
 def perform(trial: Trial) -> Record:
     """Runs a trial to its end -> its record. A crash and a time-out are records, too: failures with their reason."""
-    program = [*PROGRAM, *trial.command()[1:]]
+    program = [sys.executable, "-I", "-S", "-c", _TIED, str(os.getpid()), *PROGRAM, *trial.command()[1:]]
     options = ["--no-html", "--json", "--overwrite", "--log", str(trial.log)]
     began = time.monotonic()
     process = subprocess.Popen(
@@ -64,7 +69,6 @@ def perform(trial: Trial) -> Record:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         start_new_session=True,  # one signal reaches the run and its image processes, and Ctrl-C none of them
-        preexec_fn=_die_with_parent,
     )
     late = False
     _running.add(process)
@@ -123,11 +127,6 @@ def _numbers(out: bytes) -> dict[str, Any] | None:
     except ValueError:
         return None
     return numbers if isinstance(numbers, dict) and "outcome" in numbers else None
-
-
-def _die_with_parent() -> None:
-    """In the child: if this program is killed, so is the run; a resumed campaign does not find it still writing."""
-    _LIBC.prctl(_DIE_WITH_PARENT, signal.SIGKILL)
 
 
 def break_off() -> None:

@@ -12,6 +12,7 @@ The first command of each joint is its measured position.
 """
 
 import dataclasses as dc
+import functools
 import math
 from collections.abc import Mapping
 
@@ -73,6 +74,12 @@ class Bounds:
     speed: np.ndarray  # (n,) [1/s]
     acceleration: np.ndarray  # (n,) [1/s^2]
     drive: Drive
+
+    @functools.cached_property
+    def rows(self) -> list[tuple[float, float, float, float]]:
+        """Of each joint: low, high, speed, acceleration."""
+        limits = (self.low, self.high, self.speed, self.acceleration)
+        return list(zip(*(limit.tolist() for limit in limits)))
 
 
 def bounds(
@@ -307,24 +314,27 @@ def _joints(
     for group, part in b.parts.items():
         if group in wanted:
             asked[part] = wanted[group].tolist()[:1] if group in GRIPPERS else wanted[group].tolist()
-    now = m.position.tolist()
-    position, target = [], []
-    for want, low, high, last, at, rate, speed, acceleration in zip(
-        asked,
-        b.low.tolist(),
-        b.high.tolist(),
-        m.target.tolist(),
-        now,
-        m.velocity.tolist(),
-        b.speed.tolist(),
-        b.acceleration.tolist(),
-    ):
-        goal = min(max(at if want is None else want, low), high)
-        target.append(goal)
-        if want is None:
-            position.append(_braked(at, rate, low, high, acceleration, dt))
-        else:
-            position.append(follow(goal, (goal - last) / dt, at, rate, speed, acceleration, dt))
+    now, rates, lasts = m.position.tolist(), m.velocity.tolist(), m.target.tolist()
+    limits = b.rows
+    position: list[float] = []
+    target: list[float] = []
+    for group, part in b.parts.items():
+        if group in wanted:
+            for want, (low, high, speed, acceleration), last, at, rate in zip(
+                asked[part], limits[part], lasts[part], now[part], rates[part]
+            ):
+                goal = min(max(at if want is None else want, low), high)
+                target.append(goal)
+                position.append(follow(goal, (goal - last) / dt, at, rate, speed, acceleration, dt))
+            continue
+        target += [min(max(at, low), high) for at, (low, high, _, _) in zip(now[part], limits[part])]
+        if any(rates[part]):
+            position += [
+                _braked(at, rate, low, high, acceleration, dt)
+                for at, rate, (low, high, _, acceleration) in zip(now[part], rates[part], limits[part])
+            ]
+        else:  # it stands, as most groups do most of the time
+            position += now[part]
     velocity = [(new - at) / dt for new, at in zip(position, now)]
     limited = _limited(wanted, asked, target, position, velocity, b)
     return np.array(position), np.array(velocity), np.array(target), limited
