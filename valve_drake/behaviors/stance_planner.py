@@ -45,7 +45,7 @@ class StancePlannerConfig(Config):
     """Scenario key `stance_planner`."""
 
     KEY = "stance_planner"
-    period: float = number(1.0, 0.1, 10.0, "between two computations of the stance [s]")
+    period: float = number(0.5, 0.1, 10.0, "between two computations of the stance [s]")
 
 
 @dc.dataclass(frozen=True)
