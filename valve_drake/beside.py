@@ -22,10 +22,13 @@ PATIENCE = 0.02  # longer waits in all than the work would have taken here are a
 REST = 512  # questions that are then answered here; raise it where a busy machine stays busy
 
 
+harmless_threads = 0  # of whoever runs the program in a process of its own: they hold no lock that a copy may need
+
+
 def can_fork() -> bool:
-    """Whether a copy of this process would work: it must have no threads."""
+    """Whether a copy of this process would work: it must have no threads but harmless ones."""
     try:
-        return len(os.listdir("/proc/self/task")) == 1
+        return len(os.listdir("/proc/self/task")) <= 1 + harmless_threads
     except OSError:  # no Linux
         return False
 
