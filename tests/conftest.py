@@ -10,7 +10,7 @@ gc.set_threshold(50_000, 20, 100)  # looking for circles takes a twentieth of th
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """In a process of pytest-xdist a run copies itself as it does in one of its own, instead of starting Python anew."""
+    """In a process of pytest-xdist a run copies itself as it does in one of its own; new Pythons take 1 s longer."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         from valve_drake import beside
 
