@@ -230,7 +230,6 @@ def test_a_whole_session_by_voice_from_wav_files_over_a_radio(tmp_path, capsys):
         mode = mode_at(log, ends)
         changed = next(t for _, t, m in log.messages(["/supervisor/mode"]) if t > ends and m.mode != mode)
         late[words, seed] = changed - ends
-    print("end of the word to another mode [s]:", late)
     assert all(0.0 < each <= 0.3 for each in late.values()), late
     moves = [(one.words, one.outcome) for one in exchanges(log) if one.outcome == "given"]
     assert [words for words, _ in moves] == ["confirm", "stop", "confirm"]
