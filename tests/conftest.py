@@ -2,10 +2,12 @@
 
 import gc
 import os
+import signal
 
 import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the program has it (cli.py); before numpy is imported
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # `nohup make test` hands down that it is ignored
 gc.set_threshold(50_000, 20, 100)  # looking for circles takes a twentieth of the tests' time
 
 

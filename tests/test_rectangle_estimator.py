@@ -133,6 +133,17 @@ def test_pose_from_drawn_images(z, degrees, mm):
         assert found.corners_left.shape == found.corners_right.shape == (4, 2)
 
 
+@pytest.mark.parametrize("degrees", [66, 70])
+def test_a_marker_at_the_edge_of_what_is_drawn_is_measured(degrees):
+    # The base starts up to 60 deg aside of a panel that leans by up to 10 deg, and looks down on it.
+    rng = np.random.default_rng(1)
+    X = facing(1.9, np.radians(degrees), -0.1, 0.1, 0.03, 0.1)
+    found = estimate_rectangle(*images(X, rng), HEAD)
+    assert found.found, found.reason
+    error = pose_error(found.X_LV, X)
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.3 and 1000 * np.linalg.norm(error[3:]) < 3
+
+
 def test_one_image_and_the_paper_method_work_too():
     X = facing(0.8, 0.3, -0.25, 0.3)
     left, right = images(X, np.random.default_rng(0))

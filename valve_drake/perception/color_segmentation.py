@@ -39,7 +39,7 @@ class RegionConfig(Config):
     large_box: int = number(301, 5, 4000, "and a larger one, for large markers [px of the full image]")
     min_area: float = number(60.0, 9.0, 1e6, "of a marker [px^2]")
     max_aspect: float = number(
-        3.2, 1.0, 20.0, "long side over short side in the image (65 deg oblique makes 2.4 of a square)"
+        3.9, 1.0, 20.0, "long side over short side in the image (75 deg oblique makes 3.9 of a square)"
     )
     max_candidates: int = number(12, 1, 1000, "regions judged per image, largest contrast x area first")
 

@@ -37,7 +37,7 @@ class RectangleEstimatorConfig(Config):
     )
     min_distance: float = number(0.25, 0.01, 100.0, "of a marker [m]")
     max_distance: float = number(6.0, 0.01, 100.0, "of a marker [m]")
-    max_tilt: float = number(1.13, 0.1, 1.56, "of the marker against the line of sight [rad]")
+    max_tilt: float = number(1.3, 0.1, 1.56, "of the marker against the line of sight [rad]")
     max_iterations: int = number(15, 1, 200, "of the refinement")
     track_timeout: float = number(3.0, 0.0, 3600.0, "the X axis is not followed over a longer gap [s]")
 
