@@ -336,6 +336,31 @@ def test_fine_approach_without_a_stance_fails_with_its_reason_and_never_moves():
     assert run.time == pytest.approx(CONFIG.stance_patience, abs=0.1)
 
 
+def test_fine_approach_waits_for_a_search_that_takes_longer_than_its_patience():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
+    long = CONFIG.stance_patience + 8
+    run = drive(
+        Mode.FINE_APPROACH,
+        Wheels(place(scene, 0.0, 1.6)),
+        scene,
+        alter=lambda t, seen: seen if t > long else (*seen[:2], Stance()),
+    )
+    assert_arrived(run, scene)
+    assert run.time > long
+
+
+def test_fine_approach_does_not_wait_for_a_search_without_a_pose():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
+    run = drive(
+        Mode.FINE_APPROACH,
+        Wheels(place(scene, 0.0, 1.6)),
+        scene,
+        alter=lambda t, seen: (seen[0], RectangleEstimate(time=t), Stance()),
+    )
+    assert (run.status.verdict, run.status.detail) == (Verdict.REACH_LIMIT, "no stance: the marker's pose is not known")
+    assert run.time == pytest.approx(CONFIG.stance_patience, abs=0.1)
+
+
 def test_fine_approach_gives_up_after_its_attempts():
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
 

@@ -16,7 +16,6 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPor
 from pydrake.systems.primitives import Multiplexer
 
 from valve_drake import named_files
-from valve_drake.behaviors.base_approach import BaseApproachConfig
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.behaviors.blind_servo import STRAIGHT, BlindServo
 from valve_drake.behaviors.grasp_geometry import Turn
@@ -66,7 +65,6 @@ from valve_drake.task.modes import BEHAVIORS
 from valve_drake.valve.valve import turned
 
 DRIVING_START = 0.9  # a robot that drives begins no nearer to the valve: its base and arms are clear of the panel [m]
-PATIENCE = 25.0  # with a search for a stance of redundant arms; raise it for lifts of many heights [s]
 
 MEASURED = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and not isinstance(spec.kind, type))
 
@@ -323,7 +321,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             look=valve.look(),
             drive=robot.drive,
         ),
-        BaseApproachSystem(_patient(scenario.base_approach, robot), valve, robot.drive, robot.turning_room),
+        BaseApproachSystem(scenario.base_approach, valve, robot.drive, robot.turning_room),
         StancePlannerSystem(StancePlanner(scenario.stance_planner, stances)),
         KinematicApproachSystem(KinematicApproach(scenario.kinematic_approach, robot, valve, area)),
         ImageServoSystem(servo),
@@ -338,13 +336,6 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             else []
         ),
     ]
-
-
-def _patient(config: BaseApproachConfig, robot: Robot) -> BaseApproachConfig:
-    """Redundant arms are searched for longer: unless the patience was chosen, it is theirs."""
-    redundant = any(len(arm) > 6 for arm in robot.arms.values())
-    chosen = config.stance_patience != BaseApproachConfig().stance_patience
-    return dc.replace(config, stance_patience=PATIENCE) if redundant and not chosen else config
 
 
 def make_diagram(

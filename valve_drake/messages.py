@@ -498,9 +498,7 @@ class GraspPlan(Message):
     q_standoff: np.ndarray = array(-1)  # both arms at the stand-offs before the grasps, left first [rad]
     posture: np.ndarray = array(-1)  # lift and waist from which they are reached [m, rad]
     margin: float = 0.0  # least arm margin over the whole turn, 1 is comfortable
-    way: np.ndarray = array(
-        -1
-    )  # both arms at angles spread evenly over the turn, left first, one after the other [rad]
+    way: np.ndarray = array(-1)  # both arms at angles spread evenly over the turn, left first, pose by pose [rad]
 
 
 @dc.dataclass(frozen=True, eq=False)

@@ -95,10 +95,7 @@ class BaseApproachConfig(Config):
     still_rate: float = number(0.02, 0.002, 0.1, "a base that turns slower is at rest [rad/s]")
     attempts: int = number(4, 1, 20, "at driving in straight, before it fails")
     stance_patience: float = number(
-        12.0,
-        0.5,
-        60.0,
-        "waits so long for a first stance; raise it for arms and lifts that are searched for longer [s]",
+        12.0, 0.5, 60.0, "waits so long for the marker's pose, or for another one where none has a stance [s]"
     )
     retreat_distance: float = number(0.5, 0.05, 2.0, "straight back from the stance [m]")
     retreat_speed: float = number(0.3, 0.02, 0.5, "[m/s]")
@@ -337,10 +334,10 @@ def _fine(
     if stance.found and stance.time > m.stance.seen:
         m = changed(m, stance=m.stance.add(stance.time, stance.base, config.sightings), posture=stance.posture)
     if not (_sure(config, m.panel) and _sure(config, m.stance)):
-        if time - m.since > config.stance_patience:
-            known = f"no stance was found in {config.stance_patience:g} s" if m.panel.places else ""
-            why = stance.reason or known or "no stance: the marker's pose is not known"
-            return _end(m, "failed", Verdict.REACH_LIMIT, why)
+        # A search that is under way ends by itself, sooner or later by how many joints and places there are.
+        under_way = _sure(config, m.panel) and not stance.reason
+        if time - m.since > config.stance_patience and not under_way:
+            return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
         return changed(m, detail="waiting for a stance"), STILL
     goal, panel = m.stance.median, m.panel.median
     if np.isnan(panel[2]):  # an upright axis: a plane behind its post, facing the stance

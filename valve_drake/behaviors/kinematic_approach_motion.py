@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from valve_drake.behaviors.joint_path import Path
+from valve_drake.behaviors.valve_search import MOVED
 from valve_drake.config import Config, number
 from valve_drake.frames import apply, compose, inverse, make, planar
 from valve_drake.memory import changed
@@ -86,7 +87,6 @@ class Inputs(NamedTuple):
     path: PathPlan
 
 
-MOVED = 0.03  # an estimate so far from the valve as it was measured tells of a valve that was moved [m]
 FRESH = 2.5  # if it is not older; in the modes before fold there is one every two seconds [s]
 NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms [m]
 

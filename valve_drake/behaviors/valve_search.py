@@ -45,6 +45,9 @@ from valve_drake.task.modes import FIXED, HOLD, TABLE, WATCHED
 
 HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading) in O, torso (3,) -> X_OL (3, 4)
 
+MOVED = (
+    0.03  # a valve that is seen so far from where it was measured may have been moved; estimates scatter by 2 mm [m]
+)
 LOWER = 0.22  # between two rounds of a fixed robot, less than the eyes see at once; lower it for longer lenses [rad]
 DRIVING = tuple(mode for mode in WATCHED if TABLE[mode].base != HOLD)
 
@@ -68,7 +71,10 @@ class ValveSearchConfig(Config):
     skip_time: float = number(0.5, 0.05, 10.0, "then images are ignored while the sweep moves on [s]")
     lost_after: float = number(2.0, 0.2, 30.0, "without a sighting while driving or measuring [s]")
     moved_by: float = number(
-        0.04, 0.01, 0.5, "a valve so far from where it was measured was moved; less than that the hands make up for [m]"
+        0.04,
+        MOVED,
+        0.5,
+        "a valve so far from where it was measured was moved; less than that the hands make up for [m]",
     )
     jump: float = number(
         0.5, 0.05, 5.0, "a sighting this far from the last is believed only when the old place is empty [m]"
