@@ -97,6 +97,16 @@ def test_a_holonomic_base_goes_sideways_and_its_odometry_agrees(omni):
     assert stood.read("truth.base_pose") - start == pytest.approx(moved, abs=3e-3)
 
 
+def test_a_holonomic_base_is_where_it_is_sent_while_it_turns(omni):
+    stood = Stood(scenario_of(omni, "simulation.start.distance=3"))
+    plant = stood.station.GetSubsystemByName("plant")
+    stood.set("base.twist_command", [0.1, -0.3, 0.6])
+    for time in (0.5, 1.0, 1.5, 2.0):
+        stood.simulator.AdvanceTo(time)
+        now = plant.GetOutputPort("now").Eval(plant.GetMyContextFromRoot(stood.context))
+        assert stood.read("truth.base_pose") == pytest.approx(now[plant.parts["base"]], abs=4e-3)  # one tick's way
+
+
 def test_wheels_slip_sideways_too(omni):
     slip = [f"simulation.mishap.wheel_slip_{key}" for key in ("at=0.0", "for=5.0", "share=0.5")]
     stood = Stood(scenario_of(omni, "simulation.start.distance=3", *slip))
