@@ -258,6 +258,25 @@ def test_block_looks_near_the_last_place_unless_the_mode_wants_it_afresh(afresh,
     assert [box is None for box in boxes[2:]] == [afresh, afresh]
 
 
+def test_block_that_follows_looks_as_far_as_the_marks_are():
+    marker = Marker.of([0.04, 0.04], 0.26)  # more than six lengths of its side away
+    drawing = Drawing(LENS)
+    draw_valve(drawing, facing(1.6), marker)
+    image = drawing.finish(np.random.default_rng(0))
+    dut = Rig(
+        ColorSegmentationSystem(CONFIG, reach=1.3 * marker.reach()),
+        head_left_image=frame("head_left", image, 0),
+        head_right_image=frame("head_right", image, 0),
+        mode=ModeState(head_every=1),
+    )
+    dut.run(0.1)
+    dut.fix(head_left_image=frame("l", image, 1), head_right_image=frame("r", image, 1))
+    green = dut.run(0.3).read("segmentation").left.green
+    for mark in marker.marks:
+        p = frames.apply(facing(1.6), mark[None])[0]
+        assert np.linalg.norm(green[:, :2] - LENS.project(p[:2] / p[2]), axis=1).min() < 1.0
+
+
 def test_clone_goes_its_own_way_and_repeats():
     image, dut = rig()
     dut.run(0.1)

@@ -11,6 +11,8 @@ from valve_drake import frames
 from valve_drake.camera.lens import Lens
 from valve_drake.checks import ConfigError
 from valve_drake.messages import CameraFrame, ModeState
+from valve_drake.perception import channel
+from valve_drake.perception.edges import SidesConfig
 from valve_drake.perception.handle_marker import HandleMarkerConfig, find_mark
 from valve_drake.perception.handle_marker_system import HandleMarkerSystem
 
@@ -77,6 +79,16 @@ def test_a_handle_whose_red_and_blue_are_clipped_leaves_the_mark_in_its_place():
         center, area = truth(X)
         np.testing.assert_allclose(mark.center, center, atol=0.15)
         assert abs(mark.area / area - 1) < 0.008
+
+
+def test_a_clipped_colour_has_no_weight_and_the_others_no_common_brightness():
+    core, ring = np.array([20.0, 180, 50]), np.array([255.0, 230, 250])
+    for clipped in range(3):
+        colors = np.arange(3) != clipped
+        weights = channel._between(core, ring, colors, SidesConfig(color_only=True))
+        assert weights[clipped] == 0 and abs(weights.sum()) < 1e-9 and np.abs(weights).max() > 10
+    assert not channel._between(core, ring, np.arange(3) == 1, SidesConfig(color_only=True)).any()
+    assert channel._between(core, ring, np.full(3, True), SidesConfig(color_only=False)) == pytest.approx(core - ring)
 
 
 def test_feature_moves_linearly_with_the_hand():

@@ -7,6 +7,7 @@ import pathlib
 import numpy as np
 import pytest
 from drawn_scene import edge_points, facing
+from helpers import Rig
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from robot_facts import ROBOT
@@ -15,10 +16,11 @@ from valve_drake import frames
 from valve_drake import scenario as scenarios
 from valve_drake.behaviors.kinematic_approach import KinematicApproach, KinematicApproachConfig
 from valve_drake.camera.lens import load_head
-from valve_drake.messages import GraspPlan, RectangleEstimate, RobotState, TurnState
+from valve_drake.messages import GraspPlan, ModeState, RectangleEstimate, RobotState, TurnState
 from valve_drake.perception.ambiguity import Track
 from valve_drake.perception.fusion import fuse
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, estimate
+from valve_drake.perception.rectangle_estimator_system import RectangleEstimatorSystem
 from valve_drake.recording.robot_frames import RobotFrames
 from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
@@ -73,6 +75,20 @@ def test_a_bar_that_looks_the_same_after_half_a_turn_is_followed_from_image_to_i
     assert valve(UNEVEN).repeats(False) == pytest.approx(2 * math.pi)
     even = "{xyz: [0.15, 0, 0]}, {xyz: [-0.075, 0.1299, 0]}, {xyz: [-0.075, -0.1299, 0]}"
     assert valve(even).repeats(True) == pytest.approx(2 * math.pi / 3)
+
+
+def test_a_marker_that_stands_still_is_known_again_after_a_long_gap():
+    shape, X = valve(), facing(1.3, 0.1, 0.35, 0.0, 0.0, -0.12)
+    marker, edges = shape.target(), edge_points(X, HEAD, shape.target(), 0.05)
+    P = frames.apply(X, marker.marks)
+    seen = dc.replace(edges, left=dc.replace(edges.left, green=P[:, :2] / P[:, 2:]))
+    block = RectangleEstimatorSystem(CONFIG, HEAD, lambda base, torso: np.eye(3, 4), marker)
+    dut = Rig(block, edges=dc.replace(seen, sequence=0, time=0.0), robot_state=RobotState(), mode=ModeState())
+    assert dut.run(0.1).read("estimate").axis_known
+    again = edge_points(X, HEAD, marker, 0.05, first=1)  # a corner later, and no mark
+    dut.fix(edges=dc.replace(again, sequence=1, time=60.0))
+    found = dut.run(0.3).read("estimate")
+    assert found.axis_known and found.X_LV == pytest.approx(X, abs=1e-6)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5 * math.pi, -0.5 * math.pi, 3.0])
