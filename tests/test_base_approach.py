@@ -183,6 +183,12 @@ def random_scene(rng) -> Scene:
     return Scene(np.array([*rng.uniform(-3, 3, 2), rng.uniform(-np.pi, np.pi)]), rng)
 
 
+def random_start(rng) -> tuple[Scene, np.ndarray]:
+    """A scene, and a base where rough_approach may have left it."""
+    scene = random_scene(rng)
+    return scene, place(scene, rng.uniform(-1, 1) * np.deg2rad(70), rng.uniform(1.2, 2.2), rng.uniform(-0.3, 0.3))
+
+
 def assert_arrived(run: Run, scene: Scene) -> None:
     assert run.status.state == "succeeded", run.status.detail
     error = run.poses[-1] - scene.stance()
@@ -203,8 +209,7 @@ def test_fine_approach_arrives_from_50_random_starts_within_30_s_and_off_the_pan
     rng = np.random.default_rng(5)
     times = []
     for _ in range(50):
-        scene = random_scene(rng)
-        start = place(scene, rng.uniform(-1, 1) * np.deg2rad(70), rng.uniform(1.2, 2.2), rng.uniform(-0.3, 0.3))
+        scene, start = random_start(rng)
         run = drive(Mode.FINE_APPROACH, Wheels(start), scene)
         assert_arrived(run, scene)
         assert_clear(run, scene, start)
@@ -569,8 +574,7 @@ def test_a_holonomic_base_arrives_from_50_random_starts_sooner_and_off_the_panel
     rng = np.random.default_rng(5)
     times = []
     for _ in range(50):
-        scene = random_scene(rng)
-        start = place(scene, rng.uniform(-1, 1) * np.deg2rad(70), rng.uniform(1.2, 2.2), rng.uniform(-0.3, 0.3))
+        scene, start = random_start(rng)
         run = drive(Mode.FINE_APPROACH, Omniwheels(start), scene, base=OMNI)
         assert_arrived(run, scene)
         assert_clear(run, scene, start)
