@@ -96,12 +96,3 @@ def test_its_lift_carries_hands_and_eyes_to_the_same_height(robot):
     for side in SIDES:
         q = robot.arms[side].home
         assert (robot.forward(side, q, up) - robot.forward(side, q))[2, 3] == pytest.approx(0.1)
-
-
-def test_the_base_waits_longer_for_the_stance_of_redundant_arms_unless_told(scenario):
-    def patience(*overrides, name="pr2.scenario.yaml"):
-        blocks = diagram.make_blocks(scenarios.resolve(scenarios.load(name, [*overrides, "seed=4"])))
-        return next(block for block in blocks if block.get_name() == "base_approach").config.stance_patience
-
-    assert patience() == diagram.PATIENCE > patience(name="simulated.scenario.yaml") == 12.0
-    assert patience("base_approach.stance_patience=7") == 7.0
