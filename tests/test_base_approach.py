@@ -8,7 +8,7 @@ from helpers import Rig, assert_clones_are_independent, assert_holds_between_upd
 from robot_facts import ROBOT
 
 from valve_drake.behaviors import valve_search
-from valve_drake.behaviors.base_approach import BaseApproachConfig, MedianPlace, Memory, step, within
+from valve_drake.behaviors.base_approach import BaseApproachConfig, MedianPlace, Memory, bounded, step
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, inverse, make, rot_z, wrap
@@ -629,14 +629,14 @@ def test_a_holonomic_base_goes_straight_back():
 
 def test_a_base_that_is_slower_than_the_config_is_asked_for_no_more_than_it_can():
     slow = base_drive("holonomic", [0.2, 0.1, 0.3], [0.3, 0.2, 0.4])
-    config = within(CONFIG, slow, 0.7)
+    config = bounded(CONFIG, slow, 0.7)
     assert config.clearance == 0.7 and config.yaw_rate == 0.3 and config.acceleration == 0.2
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
     scene.stance = lambda: np.array([DEPTH - 0.8, 0.0, 0.0])
     run = drive(Mode.FINE_APPROACH, Omniwheels(place(scene, 0.8, 2.0)), scene, config=CONFIG, base=slow, limit=60.0)
     assert np.all(np.abs(run.twists[:, :2]) <= slow.speed[:2] + 1e-9)
     assert np.max(np.abs(run.twists[:, 1])) == pytest.approx(0.1, abs=0.01)  # the direction is kept
-    assert within(CONFIG, DIFFERENTIAL, 0.0) == CONFIG  # ours can do all that the config asks
+    assert bounded(CONFIG, DIFFERENTIAL, 0.0) == CONFIG  # ours can do all that the config asks
 
 
 def at_origin(seen, reason=""):

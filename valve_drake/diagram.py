@@ -29,7 +29,7 @@ from valve_drake.behaviors.stance_planner import StancePlanner
 from valve_drake.behaviors.stance_planner_system import StancePlannerSystem
 from valve_drake.behaviors.stance_search import Stances
 from valve_drake.behaviors.taught import load_taught
-from valve_drake.behaviors.valve_search import GazeLimits, ValveSearchConfig, within
+from valve_drake.behaviors.valve_search import GazeLimits, ValveSearchConfig, reachable
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError, require
@@ -201,7 +201,7 @@ def _gaze(search: ValveSearchConfig, robot: Robot) -> tuple[ValveSearchConfig, l
         return max(min(-limits[joint][0], limits[joint][1]), 0.0)
 
     waist = None if robot.waist is None else both(robot.torso.names[robot.waist])
-    return within(search, GazeLimits(pitch, both(robot.torso.names[-1]), waist))
+    return reachable(search, GazeLimits(pitch, both(robot.torso.names[-1]), waist))
 
 
 def start_of(scenario: Scenario) -> RobotStart | None:

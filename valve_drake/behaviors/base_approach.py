@@ -105,7 +105,7 @@ class BaseApproachConfig(Config):
         require(below, f"{key}.rough_stop", f"below rough_distance, {self.rough_distance:g}", self.rough_stop)
 
 
-def within(config: BaseApproachConfig, drive: Drive, room: float) -> BaseApproachConfig:
+def bounded(config: BaseApproachConfig, drive: Drive, room: float) -> BaseApproachConfig:
     """The config with no more than the base can do, and the room that it needs to turn before a panel [m]."""
     if drive.fixed:
         return config
@@ -115,8 +115,8 @@ def within(config: BaseApproachConfig, drive: Drive, room: float) -> BaseApproac
         "acceleration": float(np.min(drive.acceleration[:-1])),
         "yaw_acceleration": float(drive.acceleration[-1]),
     }
-    bounded = {name: min(getattr(config, name), value) for name, value in most.items()}
-    return dc.replace(config, clearance=max(config.clearance, room), **bounded)
+    lower = {name: min(getattr(config, name), value) for name, value in most.items()}
+    return dc.replace(config, clearance=max(config.clearance, room), **lower)
 
 
 @dc.dataclass(frozen=True, eq=False)

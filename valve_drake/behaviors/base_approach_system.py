@@ -1,6 +1,6 @@
 """Block `base_approach`: stages 1 and 2 on ports. No mathematics here."""
 
-from valve_drake.behaviors.base_approach import MODES, BaseApproachConfig, Memory, step, within
+from valve_drake.behaviors.base_approach import MODES, BaseApproachConfig, Memory, bounded, step
 from valve_drake.messages import Command, ModeState, RectangleEstimate, RobotState, Stance, Status, StereoPosition
 from valve_drake.ports import TICK, Block, Inputs, Outputs
 from valve_drake.robot.drive import DIFFERENTIAL, Drive
@@ -43,7 +43,7 @@ class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
         name: str = "base_approach",
     ):
         config.check()
-        self.config = within(config, drive, room)
+        self.config = bounded(config, drive, room)
         self.valve = valve
         self.drive = drive
         super().__init__(name, period=2 * TICK)

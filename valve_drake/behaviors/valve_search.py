@@ -108,7 +108,7 @@ class GazeLimits:
     waist: float | None
 
 
-def within(config: ValveSearchConfig, limits: GazeLimits) -> tuple[ValveSearchConfig, list[str]]:
+def reachable(config: ValveSearchConfig, limits: GazeLimits) -> tuple[ValveSearchConfig, list[str]]:
     """The gaze as this robot's joints can do it, and a line for every value that is not as configured.
 
     A default is clipped; a value that was chosen is refused, by a ConfigError that names the key. A value that equals
