@@ -7,12 +7,14 @@ import io
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
 import textwrap
 import time
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from valve_drake.campaign import campaign, comparison, executors, failures, hunt
 from valve_drake.campaign.campaign import Campaign
 from valve_drake.campaign.trial import Trial, perform, turned
 from valve_drake.checks import ConfigError, OperationFailed
+from valve_drake.recording.active import ActiveFile
 
 # Stands for `valve-drake run`: it answers after a while, by its seed. It leaves a log, and a line of every run begun.
 FAKE = """
@@ -216,13 +219,148 @@ def test_a_trial_that_its_executor_loses_is_one_line_and_is_run_by_the_next_call
     assert [r["seed"] for r in run(wanted(tmp_path / "out", 1))] == [1]
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"scenario": "simulated", "seed": 2, "outcome": "done"}'])
+HALF = '{"scenario": "simulated", "seed": 1, "outcome": "done"}'
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", "[" * 100_000, HALF, HALF.replace("1", "2")])
 def test_a_file_that_is_not_the_record_is_one_line_that_names_it(tmp_path, fake, text):
     run(wanted(tmp_path / "out", 1))
     path = tmp_path / "out/records/simulated-1.json"
     path.write_text(text)
     with pytest.raises(ConfigError, match="simulated-1.json: not .* remove it, and the trial is run again"):
         run(wanted(tmp_path / "out", 1))
+
+
+WHOLE = {"scenario": "s", "seed": 1, "outcome": "done", "verdict": "turned", "reason": "", "mode": "turn"}
+WHOLE |= {"draws": {"a": 1.0}, "times": {}}
+
+
+def folder(out: Path, *records: object, plan: object = None) -> str:
+    """A campaign's folder with these records; text stands for itself."""
+    (out / "records").mkdir(parents=True)
+    for k, one in enumerate((plan or {"scenarios": {}, "versions": {}}, *records)):
+        path = out / (f"records/{k}.json" if k else "campaign.json")
+        path.write_text(one if isinstance(one, str) else json.dumps(one))
+    return str(out)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seed": "a"},
+        {"times": None},
+        {"times": {"processor_s": 3}},
+        {"verdict": None},
+        {"draws": []},
+        {"draws": {"a": "low"}},
+        {"contact_honesty": {"left": None, "right": 1.0}},
+        {"slips": 3},
+        {"estimator_nees": "0.8"},
+        {"retries": 10**400},
+        {"command": 7},
+    ],
+)
+def test_a_record_that_is_damaged_within_is_one_line_that_names_it(tmp_path, capsys, change):
+    wrong = folder(tmp_path / "out", WHOLE, WHOLE | {"seed": 2} | change)
+    for words in (["runs", wrong], ["campaign", "compare", wrong, wrong]):
+        assert cli.main(words) == 2
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1 and "records/2.json: not a record of a campaign" in lines[0]
+
+
+@pytest.mark.parametrize("plan", ["[" * 100_000, "3", '{"scenarios": {}, "versions": []}'])
+def test_a_damaged_plan_is_one_line(tmp_path, capsys, plan):
+    wrong = folder(tmp_path / "out", WHOLE, plan=plan)
+    for words in (["runs", wrong], ["campaign", "--runs", "1", "--out", wrong]):
+        assert cli.main(words) == 2
+        assert "out: not the folder of a campaign (campaign.json is damaged)" in capsys.readouterr().err
+
+
+def test_numbers_that_are_none_are_not_known_and_no_json_has_them(tmp_path, capsys):
+    values = {"valve_angle_true_rad": math.nan, "valve_angle_command_rad": 1.0, "estimator_nees": math.inf}
+    one = folder(tmp_path / "out", WHOLE | values, WHOLE | {"seed": 2})
+    assert cli.main(["runs", one, "--html", str(tmp_path / "page.html"), "--json"]) == 0
+    numbers = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(name))
+    assert numbers["runs"] == 2 and numbers["verdicts_against_truth"]["known"] == 0
+    assert not {"nan", "inf"} & set((tmp_path / "page.html").read_text().lower().replace("<", ">").split(">"))
+
+
+def test_figures_that_differ_by_rounding_only_have_a_distribution(tmp_path):
+    shares = [1.0, 0.9999999999999999, 0.9999999999999998]
+    rows = [WHOLE | {"seed": k, "contact_honesty": {"left": 1.0, "right": share}} for k, share in enumerate(shares)]
+    page = report.page(rows, tmp_path)
+    assert page.count("<title>held by both pads, worse hand [%]</title>") == 2
+
+
+def test_a_page_elsewhere_leads_to_the_logs_and_reviews_whatever_they_are_called(tmp_path, capsys):
+    logs = [WHOLE | {"seed": 1, "log": "logs/50% #1?-1.mcap"}, WHOLE | {"seed": 2, "log": "logs/a-2.mcap"}]
+    out = Path(folder(tmp_path / "out", *logs))
+    (out / "logs").mkdir()
+    (out / "logs/a-2.review.html").touch()
+    for html in (out / "page.html", tmp_path / "page.html"):
+        assert cli.main(["runs", str(out), "--html", str(html)]) == 0
+        links = re.findall(r'href="([^"]*)"', html.read_text())
+        there = [str((html.parent / unquote(link)).relative_to(out)) for link in links]
+        assert there == ["logs/50% #1?-1.mcap", "logs/a-2.review.html"] and not any(set("#?") & set(x) for x in links)
+
+
+# Stands for a run that is killed in the midst of its log; of another one, it takes the next free name, as logs do.
+LOGGED = """
+import json, os, signal, sys
+from pathlib import Path
+words = sys.argv[1:]
+seed, log = int(words[words.index("--seed") + 1]), Path(words[words.index("--log") + 1])
+if Path(f"{log}.active").exists():
+    log = log.with_name(f"{log.stem}-2.mcap")
+Path(f"{log}.active").write_bytes(b"half")
+if seed == 7:
+    os.kill(os.getpid(), signal.SIGKILL)
+os.replace(f"{log}.active", log)
+log.with_suffix(".json").write_text("{}")
+numbers = {"outcome": "done" if seed != 8 else "failed", "verdict": "turned", "reason": "", "log": str(log)}
+numbers |= {"mode_durations_s": {"measure": 1.0, "turn": 2.0}, "last_mode": "measure"}
+print(json.dumps(numbers))
+"""
+
+
+@pytest.mark.parametrize(
+    "keep, kept",
+    [
+        ("all", ["simulated-6.mcap", "simulated-7.mcap.active", "simulated-8.mcap"]),
+        ("failed", ["simulated-7.mcap.active", "simulated-8.mcap"]),
+        ("none", []),
+    ],
+)
+def test_what_a_killed_run_has_logged_is_kept_as_other_logs_and_is_in_nobodys_way(tmp_path, monkeypatch, keep, kept):
+    program = tmp_path / "logged.py"
+    program.write_text(LOGGED)
+    monkeypatch.setattr(trial, "PROGRAM", (sys.executable, "-S", str(program)))
+    logs = tmp_path / "out/logs"
+    run(wanted(tmp_path / "out", 1, 6, keep="none"))
+    (tmp_path / "out/records/simulated-6.json").unlink()
+    for seed in (6, 8):  # the campaign was killed before these had ended
+        (logs / f"simulated-{seed}.mcap.active").write_bytes(b"old")
+    records = run(wanted(tmp_path / "out", 3, 6, keep=keep))
+    assert sorted(path.name for path in logs.iterdir() if path.suffix != ".json") == kept
+    assert [r["log"] for r in records if r["log"]] == [f"logs/{name}" for name in kept]
+    assert records[1]["outcome"] == "crashed" and "exit code -9" in records[1]["reason"]
+    assert (
+        records[0]["mode"] == "measure"
+    )  # where it ended, which is not the one that it entered last for the first time
+    assert keep != "none" or list(logs.iterdir()) == []
+
+
+def test_a_trial_whose_log_another_run_still_writes_has_its_own_log(tmp_path, monkeypatch):
+    program = tmp_path / "logged.py"
+    program.write_text(LOGGED)
+    monkeypatch.setattr(trial, "PROGRAM", (sys.executable, "-S", str(program)))
+    run(wanted(tmp_path / "out", 1, 8, keep="none"))
+    (tmp_path / "out/records/simulated-8.json").unlink()
+    under_way = ActiveFile(tmp_path / "out/logs/simulated-8.mcap")
+    (record,) = run(wanted(tmp_path / "out", 1, 8))
+    assert record["log"] == "logs/simulated-8-2.mcap" and (tmp_path / "out" / record["log"]).exists()
+    assert under_way.where() is not None
+    under_way.discard()
 
 
 def test_the_runs_of_a_campaign_that_is_killed_die_with_it(tmp_path, fake, monkeypatch):
@@ -351,6 +489,31 @@ def test_failures_are_a_list_that_is_run_again(tmp_path, edge, monkeypatch, caps
     assert cli.main(["campaign", "--again", "hunt/failures.yaml", "--runs", "2", "--out", "mended", "--json"]) == 0
 
 
+def listed(path: Path, *seeds: int) -> str:
+    path.write_text("failures: [" + ", ".join(f"{{seed: {seed}}}" for seed in seeds) + "]")
+    return str(path)
+
+
+def test_failures_run_again_at_the_same_time_and_more_of_a_list_go_on(tmp_path, fake, monkeypatch, capsys):
+    monkeypatch.setenv("TAKES", "1")
+    monkeypatch.chdir(tmp_path)
+    words = ["campaign", "--again", listed(tmp_path / "list.yaml", 3, 4, 5, 6), "--jobs", "4", "--json", "--out", "out"]
+    start = time.monotonic()
+    assert cli.main([*words, "--runs", "3"]) == 0
+    assert time.monotonic() - start < 2.9, "one after the other"
+    capsys.readouterr()
+    assert cli.main(words) == 0
+    out = capsys.readouterr()
+    assert json.loads(out.out)["runs"] == 4 and out.err.count("3 of 4 runs are there already") == 1
+    assert cli.main([*words, "--runs", "2"]) == 0  # of them
+    assert sorted(fake.read_text().split()) == ["3", "4", "5", "6"]
+    listed(tmp_path / "list.yaml", 3, 4, 8)
+    capsys.readouterr()
+    assert cli.main(words) == 2
+    assert "holds a campaign of other seeds" in capsys.readouterr().err
+    assert len(campaign.plan(Path("out"))["scenarios"]) == 4
+
+
 def test_the_list_that_ci_repeats_can_be_run(tmp_path):
     entries = failures.read(Path(__file__).with_name("failures.yaml"))
     assert len(entries) >= 2
@@ -416,6 +579,11 @@ def test_two_campaigns_do_not_share_a_folder(tmp_path, fake):
         (["simulated.scenario.yaml", "simulated"], "two scenarios are called simulated"),
         (["nothing.yaml"], "nothing.yaml"),
         (["--time-out", "0"], "--time-out must be above 0"),
+        (["--time-out", "inf"], "--time-out must be above 0 s and at most 1e+06 s, got inf"),
+        (["--time-out", "nan"], "--time-out must be above 0"),
+        (["--out", "/dev/null"], "--out must be a new folder or that of a campaign, got '/dev/null'"),
+        (["compare", "a", "b", "--hunt"], "campaign compare takes no --hunt: its runs have been made"),
+        (["compare", "a", "b", "--first-seed", "3"], "campaign compare takes no --first-seed"),
         (["--again", "a.yaml", "--hunt"], "--again goes with no scenario and no --hunt"),
         (["--again", "a.yaml"], "a.yaml"),
         (["compare", "a"], "campaign compare takes the folders of two campaigns, got 1"),
@@ -428,6 +596,17 @@ def test_wrong_arguments_are_one_line(tmp_path, monkeypatch, capsys, words, erro
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and error in lines[0]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_compare_pairs_no_runs_that_have_nothing_in_common(tmp_path):
+    one, two = folder(tmp_path / "one", WHOLE), folder(tmp_path / "two", WHOLE | {"scenario": "t"})
+    assert comparison.compare(Path(one), Path(two))["pairs"] == 1  # another name, the same seed
+    both = folder(tmp_path / "both", WHOLE | {"scenario": "u"}, WHOLE | {"scenario": "v"})
+    with pytest.raises(ConfigError, match="have no run in common, and .*both has 2 scenarios"):
+        comparison.compare(Path(one), Path(both))
+    hunted = folder(tmp_path / "hunt", WHOLE, plan={"scenarios": {}, "versions": {}, "hunt": True})
+    with pytest.raises(ConfigError, match="hunt is a hunt"):
+        comparison.compare(Path(one), Path(hunted))
 
 
 # ---------------------------------------------------------------- pages and comparison

@@ -50,6 +50,11 @@ def require(ok: bool, key: str, rule: str, value: object) -> None:
         raise ConfigError(f"{key} must be {rule}, got {shown(value)}")
 
 
+def is_number(value: object) -> bool:
+    """Whether it is a finite number; a truth value is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 <= value <= 1e300
+
+
 def require_in(value: float, low: float, high: float, key: str) -> None:
     """`value` is a finite number within [low, high]."""
     good = isinstance(value, int | float) and math.isfinite(value) and low <= value <= high

@@ -6,12 +6,14 @@ moves is claimed by recording/container.py, which keeps to the same rules.
 """
 
 import contextlib
+import json
+import math
 import os
 import secrets
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import IO, TypeAlias
+from typing import IO, Any, TypeAlias
 
 from valve_drake.checks import ConfigError, OperationFailed, shown
 
@@ -67,6 +69,28 @@ def check_folder(
     for name in names:
         check(folder / name, option, inputs, made_before, new_folders=True)
     return folder
+
+
+def json_text(tree: Any, indent: int | None = None) -> str:
+    """A tree as JSON that every reader takes: numbers that are not finite, which JSON does not know, are null."""
+    return json.dumps(finite(tree), indent=indent, allow_nan=False)
+
+
+def finite(tree: Any) -> Any:
+    """A tree of dicts and lists with None for every number that is not finite."""
+    if isinstance(tree, dict):
+        return {key: finite(value) for key, value in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [finite(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
+
+
+def parse_json(data: bytes) -> Any:
+    """What JSON holds; NaN and infinities, which others write, are None. Raises ValueError, nothing else."""
+    try:
+        return json.loads(data, parse_constant=lambda name: None)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
 
 
 def make_folder(path: PathLike) -> None:

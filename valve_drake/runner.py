@@ -117,6 +117,7 @@ class Result:
             "verdict": s.verdict,
             "reason": s.reason,
             "mode_durations_s": {mode: round(t, 4) for mode, t in s.mode_durations().items()},
+            "last_mode": s.last_mode,
             **figures(s),
             "wall_time_s": self.wall_time,
             "real_time_factor": s.sim_time_s / max(self.wall_time, 1e-9),

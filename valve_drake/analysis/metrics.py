@@ -105,6 +105,11 @@ class Summary:
     selector_refused: dict[str, int] = dc.field(default_factory=dict)
     selector_tripped: dict[str, int] = dc.field(default_factory=dict)
 
+    @property
+    def last_mode(self) -> str:
+        """The mode in which the run ended: the last one before its outcome; "" if there was none."""
+        return next((span.mode for span in reversed(self.spans) if span.mode != self.outcome), "")
+
     def mode_durations(self) -> dict[str, float]:
         """Seconds by mode, in the order of first entry."""
         out: dict[str, float] = {}

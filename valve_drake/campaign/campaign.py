@@ -14,7 +14,6 @@ import contextlib
 import dataclasses as dc
 import fcntl
 import itertools
-import json
 import math
 import os
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -24,11 +23,12 @@ from typing import Any
 import numpy as np
 
 from valve_drake import config, outputs, scenario
+from valve_drake.analysis.metrics import Summary, figures
 from valve_drake.campaign import hunting
 from valve_drake.campaign.failures import Failure
 from valve_drake.campaign.statistics import interval
-from valve_drake.campaign.trial import Record, Trial, perform, turned
-from valve_drake.checks import ConfigError, OperationFailed, require
+from valve_drake.campaign.trial import Record, Trial, files_of, perform, turned
+from valve_drake.checks import ConfigError, OperationFailed, is_number, require, shown
 from valve_drake.config import Uniform
 from valve_drake.versions import versions
 
@@ -36,6 +36,8 @@ PLAN, RECORDS, LOGS = "campaign.json", "records", "logs"
 SAMPLE = 50  # of the turned runs, the log of every so many'th seed is kept as well, unless none are
 MOST = 100_000  # runs of one campaign
 MANY = 256  # trials that wait for an executor at a time
+_FIGURES = figures(Summary()).keys() - {"contact_honesty", "slips", "collided"}  # of a record, that are one number
+LATEST = 1e6  # that a run may take, by the wall's clock [s]
 
 
 @dc.dataclass(frozen=True)
@@ -81,6 +83,7 @@ class Campaign:
         require(
             0 <= self.first_seed and last < 2**31, "--first-seed", "0 or more, the last below 2^31", self.first_seed
         )
+        require(0 < self.time_out <= LATEST, "--time-out", f"above 0 s and at most {LATEST:g} s", self.time_out)
         for path, overrides in self.named.values():
             given = scenario.load(path, overrides)
             wire = given.operator_channel.wire
@@ -94,15 +97,16 @@ class Campaign:
         records: by the trials' keys, filled in between the batches. Raises ConfigError as `check` does.
         """
         self.check()
+        known: list[Trial] = []  # without looking at records
         for (name, (path, overrides)), entry in itertools.zip_longest(self.named.items(), self.again):
             given = scenario.load(path, overrides)
             if self.hunt:
                 yield from self._hunted(name, path, given, records)
-            elif entry is not None:
-                yield [self._trial(name, path, given, entry.seed, overrides)]
             else:
-                seeds = range(self.first_seed, self.first_seed + self.runs)
-                yield [self._trial(name, path, given, seed, overrides) for seed in seeds]
+                seeds = range(self.first_seed, self.first_seed + self.runs) if entry is None else (entry.seed,)
+                known += [self._trial(name, path, given, seed, overrides) for seed in seeds]
+        if known:
+            yield known
 
     def _hunted(
         self, name: str, path: str, given: scenario.Scenario, records: Mapping[str, Record]
@@ -229,12 +233,13 @@ def _made(future: "concurrent.futures.Future[Record]", trial: Trial) -> Record:
 def finished(campaign: Campaign, trial: Trial, record: Record) -> Record:
     """Keeps the log or not, and writes the record: from then on the trial counts."""
     keep = campaign.keep == "all" or (campaign.keep == "failed" and (not turned(record) or trial.seed % SAMPLE == 0))
-    if not keep:
-        for path in (trial.log, trial.log.with_suffix(".json")):
+    log = None if record["log"] is None else trial.log.with_name(record["log"])
+    if log is not None and not keep:
+        for path in files_of(log):
             with contextlib.suppress(FileNotFoundError):
                 path.unlink()
-    record = record | {"log": f"{LOGS}/{trial.log.name}" if keep and trial.log.exists() else None}
-    outputs.write(record_path(campaign.out, trial), json.dumps(record, indent=1) + "\n")
+    record = record | {"log": f"{LOGS}/{log.name}" if log is not None and keep else None}
+    outputs.write(record_path(campaign.out, trial), outputs.json_text(record, indent=1) + "\n")
     return record
 
 
@@ -248,7 +253,8 @@ def read(out: Path, trial: Trial) -> Record | None:
     if not path.exists():
         return None
     record = _load(path)
-    if (record["scenario"], record["seed"], record.get("draws")) != (trial.name, trial.seed, dict(trial.draws)):
+    its = record["scenario"], record["seed"], record["draws"]
+    if its != (trial.name, trial.seed, dict(trial.draws)) or "command" not in record:
         raise ConfigError(f"{path}: not the record of {trial.key}; remove it, and the trial is run again")
     return record
 
@@ -263,21 +269,52 @@ def read_all(out: Path) -> list[Record]:
 def _load(path: Path) -> Record:
     """One record. Raises ConfigError."""
     try:
-        record: Record = json.loads(path.read_bytes())
-        record["scenario"], record["seed"], record["outcome"]
-    except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"{path}: not a record of a campaign; remove it, and the trial is run again") from None
+        record: Record = outputs.parse_json(path.read_bytes())
+    except (OSError, ValueError):
+        record = {}
+    if not _is_record(record):
+        raise ConfigError(f"{path}: not a record of a campaign; remove it, and the trial is run again")
     return record
+
+
+def _is_record(record: Any) -> bool:
+    """Whether all that is made of records can be made of this one."""
+
+    def numbers(value: Any) -> bool:
+        return isinstance(value, dict) and all(map(is_number, value.values()))
+
+    if not isinstance(record, dict):
+        return False
+    texts = (record.get(key) for key in ("scenario", "outcome", "verdict", "reason", "mode"))
+    known = (record.get(key) for key in _FIGURES)
+    several = (record.get(key) for key in ("contact_honesty", "slips"))
+    times = record.get("times")
+    spent = times.get("processor_s") if isinstance(times, dict) else None
+    words = record.get("command", [])
+    return (
+        all(isinstance(text, str) for text in texts)
+        and isinstance(record.get("seed"), int)
+        and isinstance(times, dict)
+        and numbers(record.get("draws"))
+        and all(value is None or is_number(value) for value in known)
+        and all(value is None or numbers(value) for value in several)
+        and (spent is None or (isinstance(spent, dict) and is_number(spent.get("total"))))
+        and isinstance(words, list)
+        and all(isinstance(word, str) for word in words)
+        and isinstance(record.get("log"), str | None)
+    )
 
 
 def plan(out: Path) -> dict[str, Any]:
     """What a campaign's folder says that it is. Raises ConfigError."""
     try:
-        found = json.loads((out / PLAN).read_bytes())
-        found["scenarios"], found["versions"]
-    except (OSError, ValueError, KeyError, TypeError):
+        found = outputs.parse_json((out / PLAN).read_bytes())
+    except OSError:
         raise ConfigError(f"{out}: not the folder of a campaign (it has no {PLAN})") from None
-    assert isinstance(found, dict)
+    except ValueError:
+        found = None
+    if not (isinstance(found, dict) and all(isinstance(found.get(key), dict) for key in ("scenarios", "versions"))):
+        raise ConfigError(f"{out}: not the folder of a campaign ({PLAN} is damaged)")
     return found
 
 
@@ -285,40 +322,62 @@ def plan(out: Path) -> dict[str, Any]:
 def _claimed(campaign: Campaign) -> Iterator[None]:
     """The folder is this campaign's, and nobody else's meanwhile."""
     out = campaign.out
-    wanted = {
+    wanted: dict[str, Any] = {
         "scenarios": {
             name: scenario.dump(scenario.load(path, overrides)) for name, (path, overrides) in campaign.named.items()
         },
         "first_seed": campaign.first_seed,
         "hunt": campaign.hunt,
         "overrides": list(campaign.overrides),
+        "seeds": [entry.seed for entry in campaign.again],
         "versions": versions(),
     }
-    if out.exists() and not (out / PLAN).exists() and any(out.iterdir()):
-        raise ConfigError(f"--out must be a new folder or that of a campaign, got {str(out)!r}")
+    begun = os.path.lexists(out / PLAN)
+    if os.path.lexists(out) and not begun and not _is_empty(out):
+        raise ConfigError(f"--out must be a new folder or that of a campaign, got {shown(str(out))}")
     for folder in (out / RECORDS, out / LOGS):
         outputs.make_folder(folder)
-    lock = os.open(out / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        lock = os.open(out / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        raise OperationFailed(f"--out {str(out)!r} cannot be written: {error.strerror}") from None
     try:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise ConfigError(f"--out {str(out)!r}: a campaign is under way there") from None
-        if (out / PLAN).exists():
-            _same(plan(out), wanted, out)
-        else:
-            outputs.write(out / PLAN, json.dumps(wanted, indent=1) + "\n")
+        there = plan(out) if os.path.lexists(out / PLAN) else None
+        if there is not None:
+            _same(there, wanted, out, len(campaign.again))
+        if there is None or len(there["scenarios"]) < len(wanted["scenarios"]):
+            outputs.write(out / PLAN, outputs.json_text(wanted, indent=1) + "\n")
         yield
     finally:
         os.close(lock)
 
 
-def _same(there: dict[str, Any], wanted: dict[str, Any], out: Path) -> None:
-    """Refuses to go on with another campaign: its records would be mixed with this one's."""
-    for key in ("scenarios", "first_seed", "overrides", "hunt"):
-        if there.get(key) != wanted[key]:
-            other = "draws (--hunt)" if key == "hunt" else key.replace("_", " ")
-            raise ConfigError(f"--out {str(out)!r} holds a campaign of other {other}: choose another folder")
+def _is_empty(out: Path) -> bool:
+    """Whether it is an empty folder."""
+    try:
+        return not any(out.iterdir())
+    except OSError:  # no folder, for one
+        return False
+
+
+def _same(there: dict[str, Any], wanted: dict[str, Any], out: Path, listed: int) -> None:
+    """Refuses to go on with another campaign: its records would be mixed with this one's.
+
+    listed: how many entries of a list of failures are run again; of one list, there may have been more or less before.
+    """
+    one, other = dict(there), dict(wanted)
+    if listed and (count := min(len(one["scenarios"]), listed)):
+        for part in (one, other):
+            part["scenarios"] = dict(itertools.islice(part["scenarios"].items(), count))
+            part["seeds"] = part["seeds"][:count] if isinstance(part.get("seeds"), list) else None
+    for name in ("scenarios", "seeds", "first_seed", "overrides", "hunt"):
+        if one.get(name) != other[name]:
+            words = "draws (--hunt)" if name == "hunt" else name.replace("_", " ")
+            raise ConfigError(f"--out {str(out)!r} holds a campaign of other {words}: choose another folder")
     changed = [k for k, v in wanted["versions"].items() if there["versions"].get(k) != v]
     if changed:
         words = ", ".join(f"{k} {there['versions'].get(k)} -> {wanted['versions'][k]}" for k in changed)

@@ -22,10 +22,19 @@ FIGURES = {
 
 def compare(a: Path, b: Path) -> dict[str, Any]:
     """The object of `compare --json`: pairs of runs by scenario and seed. Raises ConfigError without pairs."""
+    for folder in (a, b):
+        if campaign.plan(folder).get("hunt"):
+            raise ConfigError(f"compare: {folder} is a hunt: what its runs draw is not their seeds'")
     one, other = ({(r["scenario"], r["seed"]): r for r in campaign.read_all(folder)} for folder in (a, b))
     keys = sorted(one.keys() & other.keys())
     if not keys:  # their scenarios may be called differently
-        one, other = ({seed: r for (_, seed), r in records.items()} for records in (one, other))
+        for folder, records in ((a, one), (b, other)):
+            names = sorted({name for name, _ in records})
+            if len(names) > 1:
+                raise ConfigError(
+                    f"compare: {a} and {b} have no run in common, and {folder} has {len(names)} scenarios"
+                )
+        one, other = ({("", seed): r for (_, seed), r in records.items()} for records in (one, other))
         keys = sorted(one.keys() & other.keys())
     if not keys:
         raise ConfigError(f"compare: {a} and {b} have no seed in common")

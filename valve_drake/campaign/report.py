@@ -8,11 +8,13 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 
+from valve_drake import outputs
 from valve_drake.analysis.metrics import figures, summarize
 from valve_drake.analysis.plots import nice_ticks
 from valve_drake.campaign.campaign import least_honesty, summary
@@ -22,6 +24,7 @@ from valve_drake.recording.reader import LogReader
 
 MADE = "Made by <code>valve-drake campaign</code>"  # in every page, see the template
 GOOD, BAD = "#2f8f5b", "#c0392b"
+_EQUAL = 1e-9  # numbers that are closer, as a share of them, are one: rounding is no distribution
 _WIDE, _HIGH, _LEFT, _BOTTOM = 340, 150, 46, 30  # of a small plot [px]
 
 # Figures of a run, as the page shows them: title, value of a record (None: not known).
@@ -57,7 +60,10 @@ def _degrees(record: Record, a: str, b: str) -> float | None:
 
 def was_made(path: Path) -> bool:
     """Whether a file is such a page."""
-    return MADE in path.read_text(encoding="utf-8", errors="replace")
+    try:
+        return MADE in path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False
 
 
 def table(records: list[Record]) -> str:
@@ -106,7 +112,7 @@ def page(records: list[Record], beside: Path, logs: Path | None = None) -> str:
 
 def _relative(path: Path, beside: Path) -> str:
     try:
-        return path.resolve().relative_to(beside.resolve()).as_posix()
+        return quote(path.resolve().relative_to(beside.resolve()).as_posix())
     except ValueError:
         return path.resolve().as_uri()
 
@@ -133,16 +139,18 @@ def _frame(title: str, x: tuple[float, float], y: tuple[float, float], body: str
 
 def _range(values: list[float]) -> tuple[float, float]:
     low, high = min(values), max(values)
-    room = 0.05 * (high - low) or 0.5 * abs(high) or 0.5
+    apart = high - low if high - low > _EQUAL * abs(high) else 0.0
+    room = 0.05 * apart or 0.5 * abs(high) or 0.5
     return low - room, high + room
 
 
 def _histogram(title: str, values: list[float | None]) -> tuple[str, Markup | None]:
-    known = [v for v in values if v is not None and math.isfinite(v)]
+    known = [v for v in values if v is not None]
     if not known:
         return title, None
     x, bins = _range(known), min(24, max(4, round(math.sqrt(len(known)))))
-    counts, edges = np.histogram(known, bins | 1, range=x if min(known) == max(known) else None)
+    around = max(known) - min(known) <= _EQUAL * abs(max(known))
+    counts, edges = np.histogram(known, bins | 1, range=x if around else None)
     y = 0.0, float(max(counts)) * 1.08
     bars = []
     for count, a, b in zip(counts, edges, edges[1:]):
@@ -205,14 +213,13 @@ def _record_of(path: Path, folder: Path) -> Record:
     except ConfigError as error:
         return record | {"outcome": "unreadable", "reason": str(error)}
     run = log.metadata.get("run", {})
-    seed = run.get("seed", "-1")
-    modes = [span.mode for span in s.spans if span.mode != s.outcome]
+    seed = run.get("seed", "")
     return record | {
         "scenario": path.stem,
-        "seed": int(seed) if seed.lstrip("-").isdigit() else -1,
+        "seed": int(seed) if seed.isdecimal() and seed.isascii() else -1,
         "outcome": s.outcome or "unfinished",
         "verdict": s.verdict,
         "reason": s.reason,
-        "mode": modes[-1] if modes else "",
-        **figures(s),
+        "mode": s.last_mode,
+        **outputs.finite(figures(s)),
     }

@@ -4,8 +4,8 @@ A record is a plain JSON object. What depends on the machine stands in its `time
 scenario and seed are equal but for that.
 """
 
+import contextlib
 import dataclasses as dc
-import json
 import os
 import signal
 import subprocess
@@ -14,7 +14,10 @@ import time
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from valve_drake import outputs
 from valve_drake.analysis.metrics import Summary, figures
+from valve_drake.recording.active import is_being_written
+from valve_drake.recording.container import active
 
 Record: TypeAlias = dict[str, Any]
 
@@ -60,6 +63,7 @@ class Trial:
 
 def perform(trial: Trial) -> Record:
     """Runs a trial to its end -> its record. A crash and a time-out are records, too: failures with their reason."""
+    _clear(trial.log)
     program = [sys.executable, "-I", "-S", "-c", _TIED, str(os.getpid()), *PROGRAM, *trial.command()[1:]]
     options = ["--no-html", "--json", "--overwrite", "--log", str(trial.log)]
     began = time.monotonic()
@@ -90,15 +94,33 @@ def perform(trial: Trial) -> Record:
         lines = errors.decode("utf-8", "replace").strip().splitlines()
         said = lines[-1][:300] if lines else "it said nothing"
         reason = f"not ended after {trial.time_out:g} s" if late else f"exit code {process.returncode}: {said}"
-        record |= {"outcome": TIMED_OUT if late else CRASHED, "reason": reason}
+        record |= {"outcome": TIMED_OUT if late else CRASHED, "reason": reason, "log": _log(trial.log)}
         return record | {"times": {"wall_time_s": wall}}
     record |= {key: numbers[key] for key in ("outcome", "verdict", "reason")}
     record["outcome"] = record["outcome"] or UNFINISHED
-    modes = list(numbers["mode_durations_s"])
-    reached = [mode for mode in modes if mode != numbers["outcome"]]
-    record |= {"mode": reached[-1] if reached else "", "mode_durations_s": numbers["mode_durations_s"]}
+    reached = [mode for mode in numbers["mode_durations_s"] if mode != numbers["outcome"]]
+    last = numbers.get("last_mode", reached[-1] if reached else "")
+    record |= {"mode": last, "mode_durations_s": numbers["mode_durations_s"]}
     record |= {key: numbers.get(key) for key in _FIGURES}
+    record |= {"log": _log(Path(numbers.get("log") or trial.log))}
     return record | {"times": {key: numbers.get(key) for key in _TIMES}}
+
+
+def _clear(log: Path) -> None:
+    """Removes what a run of this trial that was killed has left: the next one could not have the log's name."""
+    with contextlib.suppress(OSError):
+        if not is_being_written(log):
+            active(log).unlink()
+
+
+def _log(log: Path) -> str | None:
+    """The name of the log that a run has left, whole or not; None: there is none."""
+    return next((path.name for path in (log, active(log)) if path.exists()), None)
+
+
+def files_of(log: Path) -> list[Path]:
+    """A run's log and what lies beside it."""
+    return [log, log.with_name(log.name.removesuffix(".active")).with_suffix(".json")]
 
 
 def _begun(trial: Trial) -> Record:
@@ -123,7 +145,7 @@ def turned(record: Record) -> bool:
 def _numbers(out: bytes) -> dict[str, Any] | None:
     """The object that `run --json` prints; None if there is none."""
     try:
-        numbers = json.loads(out)
+        numbers = outputs.parse_json(out)
     except ValueError:
         return None
     return numbers if isinstance(numbers, dict) and "outcome" in numbers else None

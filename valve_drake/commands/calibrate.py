@@ -1,7 +1,6 @@
 """`valve-drake calibrate`: cameras from images of a chessboard."""
 
 import argparse
-import json
 import math
 from pathlib import Path
 
@@ -57,7 +56,7 @@ def command(options: argparse.Namespace) -> int:
             report = reports.intrinsics(options.images, board, options.out, options.lens, distances)
     if options.html:
         outputs.write(options.html, report.page)
-    print(json.dumps(report.numbers) if options.json else "\n".join(report.lines()))
+    print(outputs.json_text(report.numbers) if options.json else "\n".join(report.lines()))
     return OK
 
 

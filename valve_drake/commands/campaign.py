@@ -2,7 +2,7 @@
 
 import argparse
 import contextlib
-import json
+import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -39,7 +39,7 @@ def add(commands: Subcommands) -> None:
     p.add_argument("--logs", choices=("all", "failed", "none"), default="failed", help="which are kept: see docs")
     p.add_argument("--time-out", type=float, default=900.0, metavar="SECONDS", help="of one run (default: 900)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
-    p.set_defaults(command=command)
+    p.set_defaults(command=command, default=p.get_default)
     r = commands.add_parser("runs", help="a table of all logs in a folder")
     r.add_argument("folder", type=Path, help="with logs, or of a campaign")
     r.add_argument("--html", type=Path, metavar="FILE", help="the page (default: FOLDER/report.html)")
@@ -56,8 +56,6 @@ def command(options: argparse.Namespace) -> int:
     from valve_drake.campaign.executors import executor
     from valve_drake.scenario import DEFAULT
 
-    if not options.time_out > 0:
-        raise ConfigError(f"--time-out must be above 0 s, got {options.time_out}")
     given = tuple(options.scenario) or (DEFAULT,)
     kind, runs = ("hunt" if options.hunt else "campaign"), options.runs
     again: tuple[failures.Failure, ...] = ()
@@ -88,7 +86,7 @@ def command(options: argparse.Namespace) -> int:
     failures.write(out / FAILURES, campaigns.failures(records))
     numbers = campaigns.summary(records)
     if options.json:
-        print(json.dumps(numbers))
+        print(outputs.json_text(numbers))
     else:
         _print(numbers)
         say(f"report {out / REPORT}, table {out / TABLE}, failures {out / FAILURES}")
@@ -138,9 +136,12 @@ def compare(options: argparse.Namespace) -> int:
 
     if len(options.scenario) != 3:
         raise ConfigError(f"campaign compare takes the folders of two campaigns, got {len(options.scenario) - 1}")
+    others = vars(options).keys() - {"scenario", "json", "command", "default"}
+    for name in sorted(name for name in others if getattr(options, name) != options.default(name)):
+        raise ConfigError(f"campaign compare takes no --{name.replace('_', '-')}: its runs have been made")
     found = comparison.compare(*map(Path, options.scenario[1:]))
     if options.json:
-        print(json.dumps(found))
+        print(outputs.json_text(found))
         return OK
     pairs = found["pairs"]
     say(f"{pairs} seeds in both: {found['turned_a']} turned in A, {found['turned_b']} in B")
@@ -165,17 +166,17 @@ def runs(options: argparse.Namespace) -> int:
     from valve_drake.campaign import campaign as campaigns
     from valve_drake.campaign import report
 
-    if not options.folder.is_dir():
+    if not os.path.isdir(options.folder):
         raise ConfigError(f"runs: {str(options.folder)!r} is not a folder")
     html = options.html or (None if options.json else options.folder / REPORT)
     if html is not None:
         html = outputs.check(html, "--html", (), report.was_made)
-    is_campaign = (options.folder / campaigns.PLAN).exists()
+    is_campaign = os.path.lexists(options.folder / campaigns.PLAN)
     records = campaigns.read_all(options.folder) if is_campaign else report.records_of_logs(options.folder)
     if html is not None:
-        outputs.write(html, report.page(records, html.parent, None if is_campaign else options.folder))
+        outputs.write(html, report.page(records, html.parent, options.folder))
     if options.json:
-        print(json.dumps(campaigns.summary(records) | {"html": str(html) if html else None}))
+        print(outputs.json_text(campaigns.summary(records) | {"html": str(html) if html else None}))
     else:
         _print(campaigns.summary(records))
         say(f"page {html}")

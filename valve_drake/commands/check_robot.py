@@ -1,7 +1,6 @@
 """`valve-drake check-robot`: what a robot can do of the work, and what is missing, before its first run."""
 
 import argparse
-import json
 from pathlib import Path
 
 from valve_drake import outputs
@@ -38,7 +37,7 @@ def command(options: argparse.Namespace) -> int:
     if options.html is not None:
         outputs.write(options.html, robot_check_page.page(report))
     if options.json:
-        print(json.dumps(report.as_json()))
+        print(outputs.json_text(report.as_json()))
     else:
         for line in robot_check_page.lines(report):
             say(line)

@@ -1,7 +1,6 @@
 """`valve-drake estimate`: the pose of a red rectangle in one photograph, or a stereo pair."""
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,7 +53,7 @@ def command(options: argparse.Namespace) -> int:
     if drawing is not None:
         outputs.write(drawing, _drawn(options.draw, seen, cameras, size))
     if options.json:
-        print(json.dumps(_as_json(seen, others, sides, options.method, time_ms)))
+        print(outputs.json_text(_as_json(seen, others, sides, options.method, time_ms)))
     else:
         print(_as_text(seen, others, sides, options.method, time_ms))
     return OK if seen.estimate.found else FAILED

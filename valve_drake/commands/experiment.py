@@ -52,12 +52,12 @@ def command(options: argparse.Namespace) -> int:
             raise ConfigError("--out of `bound` needs matplotlib for its plot: pip install 'valve-drake[bench]'")
     result = experiments.run(name, options.seed, options.trials)
     if options.out is not None:
-        outputs.write(options.out / numbers, json.dumps(result, indent=1) + "\n")
+        outputs.write(options.out / numbers, outputs.json_text(result, indent=1) + "\n")
         if name == "bound":
             with outputs.replacing(options.out / plot) as file:
                 experiments.plot_bound(result, file)
     if options.json:
-        print(json.dumps(result))
+        print(outputs.json_text(result))
     else:
         _print_experiment(result)
     return OK

@@ -1,9 +1,9 @@
 """`valve-drake import-robot`: a model folder and the draft of a robot.yaml from a URDF."""
 
 import argparse
-import json
 from pathlib import Path
 
+from valve_drake import outputs
 from valve_drake.commands.common import OK, Subcommands, check_rendering
 from valve_drake.console import say
 
@@ -30,7 +30,7 @@ def command(options: argparse.Namespace) -> int:
         check_rendering()
     report = import_robot(options.model, options.out, options.overwrite, options.picture)
     if options.json:
-        print(json.dumps(report.as_dict()))
+        print(outputs.json_text(report.as_dict()))
     else:
         for line in report.lines():
             say(line)

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import json
 import os
 import select
 import sys
@@ -11,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from valve_drake import outputs
 from valve_drake.checks import OperationFailed, require
 from valve_drake.commands.common import FAILED, OK, Subcommands, signals
 from valve_drake.console import console as make_console
@@ -227,5 +227,5 @@ def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace,
     if options.json:
         said = [{"time_s": line.time, "who": line.who, "text": line.text} for line in desk.lines]
         facts = {"mode": state.mode, "done": state.done, "verdict": state.verdict, "reason": state.reason}
-        print(json.dumps({"good": good, "said": said} | facts))
+        print(outputs.json_text({"good": good, "said": said} | facts))
     return OK if good else FAILED

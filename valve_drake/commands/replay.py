@@ -1,11 +1,11 @@
 """`valve-drake replay`: the same blocks on what a log holds, compared with what was recorded."""
 
 import argparse
-import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from valve_drake import outputs
 from valve_drake.checks import ConfigError
 from valve_drake.commands.common import DAMAGED, FAILED, OK, Subcommands, check_log, display
 from valve_drake.console import complain, styled
@@ -43,7 +43,7 @@ def command(options: argparse.Namespace) -> int:
         complain(f"{error} ({log.damage[0]})")
         return DAMAGED
     if options.json:
-        print(json.dumps(result.as_json()))
+        print(outputs.json_text(result.as_json()))
     else:
         _print_replay(result)
     if result.log_error:

@@ -1,7 +1,6 @@
 """`valve-drake review`: one page of a log, or of two compared; or one topic as a table."""
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,7 +45,7 @@ def command(options: argparse.Namespace) -> int:
         outputs.write(html, report.comparison_page(both, beside) if both else report.page(found[0], beside))
     if options.json:
         facts = report.comparison_facts(both) if both else report.facts(found[0])
-        print(json.dumps(facts | {"html": str(html) if html else None}))
+        print(outputs.json_text(facts | {"html": str(html) if html else None}))
     else:
         for one in found:
             _print_review(one, str(one.log.path) if both else "")
@@ -107,7 +106,7 @@ def _export(options: argparse.Namespace) -> int:
     log = LogReader(options.logs[0])
     count = export.write(log, options.topic, options.export, out)
     if options.json:
-        print(json.dumps({"topic": options.topic, "messages": count, "out": str(out), "damage": log.damage}))
+        print(outputs.json_text({"topic": options.topic, "messages": count, "out": str(out), "damage": log.damage}))
     else:
         say(f"{out}: {count} messages of {options.topic}")
         for line in log.damage:

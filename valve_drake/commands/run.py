@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import dataclasses as dc
-import json
 import os
 import time
 from collections.abc import Iterator
@@ -93,12 +92,12 @@ def command(options: argparse.Namespace) -> int:
     numbers = result.as_json()
     troubles = [*result.troubles]
     try:
-        outputs.write(result.name.with_suffix(".json"), json.dumps(numbers, indent=1) + "\n")
+        outputs.write(result.name.with_suffix(".json"), outputs.json_text(numbers, indent=1) + "\n")
     except OperationFailed as error:
         if not result.log_error:  # else the disk has been complained of
             troubles.append(str(error))
     if options.json:
-        print(json.dumps(numbers))
+        print(outputs.json_text(numbers))
     else:
         _print_result(result)
     if options.profile and not options.json:

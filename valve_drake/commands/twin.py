@@ -1,9 +1,9 @@
 """`valve-drake twin`: the simulated robot as a process of its own, for station `hardware`."""
 
 import argparse
-import json
 import math
 
+from valve_drake import outputs
 from valve_drake.commands.common import OK, Subcommands, check_rendering, scenario_overrides, stopper
 
 
@@ -27,7 +27,7 @@ def command(options: argparse.Namespace) -> int:
     with stopper() as stop:
         result = run_twin(scenario, duration=options.duration, stop=stop)
     if options.json:
-        print(json.dumps(result.as_json()))
+        print(outputs.json_text(result.as_json()))
     else:
         turned = math.degrees(result.valve_end - result.valve_start)
         print(f"{result.time:.1f} s; the valve was turned by {turned:.2f} deg")

@@ -153,6 +153,11 @@ def _taken(path: Path, suffixes: Sequence[str]) -> str:
     return ""
 
 
+def is_being_written(path: Path) -> bool:
+    """Whether a program writes this log right now."""
+    return _locked(active(path))
+
+
 def _locked(path: Path) -> bool:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
