@@ -75,6 +75,7 @@ class CollisionModel:
 
     def __init__(self, robot: Robot, clearance: float | None = None, opening: float | None = None):
         shared = robot.model
+        self._follow = robot.follow if robot.couples else None
         self._robot = shared.robot
         self._plant, self._scene_graph, self._valve = shared.plant, shared.scene_graph, shared.valve
         self._root = shared.diagram.CreateDefaultContext()
@@ -118,6 +119,8 @@ class CollisionModel:
         positions[self._arms] = q
         if posture is not None and len(posture):
             positions[self._posture] = posture
+        if self._follow is not None:
+            self._follow(positions)
         angle = 0.0 if X_BA is None else stem_angle(X_BA)
         X_BP = FAR if X_BA is None else compose(turned(X_BA, -angle), self._X_AP)
         positions[self._stem] = angle

@@ -58,7 +58,7 @@ class ValveSearchConfig(Config):
 
     KEY = "valve_search"
     sweep_yaw: float = number(1.4, 0.1, 1.6, "neck yaw at the ends of a sweep [rad]")
-    sweep_waist: float = number(0.5, 0.01, 0.6, "waist twist there [rad]")
+    sweep_waist: float = number(0.5, 0.0, 0.6, "waist twist there [rad]")
     sweep_speed: float = number(1.0, 0.05, 3.0, "of the gaze [rad/s]")
     pitches: list[float] = numbers([0.15, 0.4, -0.05], -0.5, 1.1, "neck pitch of each round [rad]", count=(1, 20))
     turn_speed: float = number(0.8, 0.05, 2.0, "of the base between sweeps [rad/s]")

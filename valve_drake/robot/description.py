@@ -78,15 +78,18 @@ class ArmDescription(Config):
     """Key `arms.left` or `arms.right`.
 
     home: free of all, and out of the eyes' sight of the valve. work: where a redundant arm is drawn to at the valve,
-    and where the search for a pose begins; home by default. stiffness: of the simulated servos; the model's own by
-    default. sensor: the fixed joint whose load the wrist sensor reads, or `torque` for an arm that has none: the wrench
-    is computed from its joints' torques. torque_noise, torque_bias: standard deviations of a reading of these, and of
-    its constant error; only with `sensor: torque`, which asks for the first.
+    and where the search for a pose begins; home by default. speed: of this arm, where the two differ. stiffness: of the
+    simulated servos; the model's own by default. sensor: the fixed joint whose load the wrist sensor reads, or `torque`
+    for an arm that has none: the wrench is computed from its joints' torques. torque_noise, torque_bias: standard
+    deviations of a reading of these, and of its constant error; only with `sensor: torque`, which asks for the first.
     """
 
     joints: list[str] = names("of the model, from the shoulder on", (0, MOST_JOINTS))
     home: list[float] = numbers([], -FAR, FAR, "[rad]", count=(0, MOST_JOINTS))
     work: list[float] = numbers([], -FAR, FAR, "[rad]", count=(0, MOST_JOINTS))
+    speed: list[float] = numbers(
+        [], 0.01, 10.0, "of each joint, at most; arm_speed by default [rad/s]", count=(0, MOST_JOINTS)
+    )
     stiffness: list[float] = numbers([], 1.0, 1e5, "of each joint's servo [N m/rad]", count=(0, MOST_JOINTS))
     sensor: str = plain("", "fixed joint beyond the arm, or torque")
     torque_noise: list[float] = numbers([], 1e-4, 100.0, "of each joint's torque reading [N m]", count=(0, MOST_JOINTS))
@@ -96,7 +99,7 @@ class ArmDescription(Config):
         count = len(self.joints)
         require(count >= 5, f"{key}.joints", f"5 to {MOST_JOINTS} joints", self.joints)
         _as_many(self, key, "home", count)
-        for name in ("work", "stiffness"):
+        for name in ("work", "speed", "stiffness"):
             if getattr(self, name):
                 _as_many(self, key, name, count)
         require(bool(self.sensor), f"{key}.sensor", f"a fixed joint of the model, or {TORQUE}", self.sensor)
@@ -181,7 +184,9 @@ class RobotDescription(Config):
     lift: LiftDescription = dc.field(default_factory=LiftDescription)
     gaze: GazeDescription = dc.field(default_factory=GazeDescription)
     arms: Arms = dc.field(default_factory=Arms)
-    arm_speed: list[float] = numbers([], 0.01, 10.0, "of each joint of an arm, at most [rad/s]", count=(0, MOST_JOINTS))
+    arm_speed: list[float] = numbers(
+        [], 0.01, 10.0, "of each joint of both arms, at most [rad/s]", count=(0, MOST_JOINTS)
+    )
     grippers: Grippers = dc.field(default_factory=Grippers)
     opening: float = number(0.085, 0.01, 0.5, "of an open gripper, between the pads [m]")
     pad: PadDescription = dc.field(default_factory=PadDescription)
@@ -200,8 +205,13 @@ class RobotDescription(Config):
     def relations(self, key: str) -> None:
         prefix = f"{key}." if key else ""
         require(bool(self.model), f"{prefix}model", "given", self.model)
-        for side in SIDES:
-            count = len(getattr(self.arms, side).joints)
+        counts = [len(self.arm(side).joints) for side in SIDES]
+        for side, count in zip(SIDES, counts):
+            if self.arm(side).speed:
+                continue
+            alike = counts[0] == counts[1] or count == len(self.arm_speed)
+            words = f"given, {count} values: arm_speed is that of arms with as many joints"
+            require(alike, f"{prefix}arms.{side}.speed", words, [])
             _as_many(self, key, "arm_speed", count)
         require(bool(self.cameras["head_left"]), f"{prefix}cameras.head_left", "given", "")
         given: dict[str, str] = {}

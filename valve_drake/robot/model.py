@@ -102,11 +102,15 @@ def add_robot(
     base = frame_named(plant, model, robot.base.frame, "base.frame")
     if not base_chain(plant, model, base.body()):
         root = _root(plant, model, base.body())
+        hangs = root.index() == plant.world_body().index()  # by a weld of the file
+        if hangs and robot.base.drive != "fixed":
+            raise ConfigError("base.drive must be fixed for a model that is welded to the world")
+        carried = root.body_frame() if hangs else _carried(plant, model, root, base)
         if robot.base.drive != "fixed":
-            _add_carriages(plant, model, root)
+            _add_carriages(plant, model, root, carried)
         else:
             with _free_of_constraints(plant, model, robot, "base.drive must be one that moves"):
-                _bolt(plant, model, root, base.body(), place)
+                _bolt(plant, model, root, base.body(), carried, place)
     for key, name in named_joints(robot):
         joint = joint_named(plant, model, name, key)
         if joint.num_velocities() != 1:
@@ -225,13 +229,36 @@ def _root(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> 
     return body
 
 
+def _carried(plant: MultibodyPlant, model: ModelInstanceIndex, root: RigidBody, base: Frame) -> Frame:
+    """The base's frame B as one of the model's root, to which welds hold it: what stands on the floor and is driven."""
+    X_RootB = base.GetFixedPoseInBodyFrame()
+    joint = parent_joint(plant, model, base.body())
+    while joint is not None and joint.child_body().index() != root.index():
+        assert isinstance(joint, WeldJoint)  # no joint between root and base moves
+        X_ParentChild = (
+            joint.frame_on_parent().GetFixedPoseInBodyFrame()
+            @ joint.X_FM()
+            @ joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+        )
+        X_RootB = X_ParentChild @ X_RootB
+        joint = parent_joint(plant, model, joint.parent_body())
+    if X_RootB.IsExactlyIdentity():
+        return root.body_frame()
+    return plant.AddFrame(FixedOffsetFrame("base_on_root", root.body_frame(), X_RootB, model))
+
+
 def _bolt(
-    plant: MultibodyPlant, model: ModelInstanceIndex, root: RigidBody, base: RigidBody, place: Sequence[float]
+    plant: MultibodyPlant,
+    model: ModelInstanceIndex,
+    root: RigidBody,
+    base: RigidBody,
+    carried: Frame,
+    place: Sequence[float],
 ) -> None:
     """Welds a fixed robot to the floor; one that its file welds to the world stands there instead."""
     X_WPlace = RigidTransform(RollPitchYaw(0.0, 0.0, place[2]), [place[0], place[1], 0.0])
     if root.index() != plant.world_body().index():
-        plant.WeldFrames(plant.world_frame(), root.body_frame(), X_WPlace)
+        plant.WeldFrames(plant.world_frame(), carried, X_WPlace)
         return
     joint = parent_joint(plant, model, base)
     assert joint is not None  # the base hangs on the world
@@ -245,14 +272,15 @@ def _bolt(
     plant.WeldFrames(plant.world_frame(), child, X_WPlace @ X_WChild)
 
 
-def _add_carriages(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody) -> None:
-    """The joints base_x, base_y and base_yaw between the world and the model's root."""
+def _add_carriages(plant: MultibodyPlant, model: ModelInstanceIndex, body: RigidBody, carried: Frame) -> None:
+    """The joints base_x, base_y and base_yaw between the world and the model's root; they move its frame `carried`."""
     little = SpatialInertia(CARRIAGE, [0, 0, 0], UnitInertia.SolidSphere(0.05))
     parent = plant.world_body()
     for name, axis in (("base_x", [1, 0, 0]), ("base_y", [0, 1, 0]), ("base_yaw", [0, 0, 1])):
         child = body if name == "base_yaw" else plant.AddRigidBody(f"{name}_carriage", model, little)
         kind = RevoluteJoint if name == "base_yaw" else PrismaticJoint
-        joint = plant.AddJoint(kind(name, parent.body_frame(), child.body_frame(), axis))
+        moved = carried if name == "base_yaw" else child.body_frame()
+        joint = plant.AddJoint(kind(name, parent.body_frame(), moved, axis))
         plant.AddJointActuator(name, joint, BASE_EFFORT)
         parent = child
 

@@ -30,7 +30,7 @@ from valve_drake.frames import compose, inverse, planar
 from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.robot import description as descriptions
 from valve_drake.robot import kinematics
-from valve_drake.robot.description import TORQUE, RobotDescription
+from valve_drake.robot.description import FAR, TORQUE, RobotDescription
 from valve_drake.robot.drive import Drive, drive
 from valve_drake.robot.groups import Groups
 from valve_drake.robot.kinematics import Arm, HandLoad, Joints
@@ -48,6 +48,7 @@ from valve_drake.valve.valve import Valve
 _ORIGIN = np.zeros(3)
 _OPENINGS = 65  # positions of a gripper's joint at which its opening is read
 ROOM = 0.2  # between a base that turns and a panel [m]
+_ON_WAY = 1e-4  # by which a base's frame may be off the way of its joints [m, rad]
 _TOUCH = 1e-4  # an opening may lack so much of what is asked for [m]
 
 
@@ -90,6 +91,9 @@ class _Chain:
 
     q: np.ndarray  # (n,)
     v: np.ndarray
+    followers: tuple[
+        tuple[int, int, float], ...
+    ]  # on the way to the hand: whom one follows (0 .. n-1), its v, how fast
     grip: Frame
     shoulder: Frame  # that the first joint turns in
     reach: float  # of the grip point from there, at most [m]
@@ -110,11 +114,13 @@ class Robot:
     gaze_signs: np.ndarray  # of waist, tilt, pan: 1 where it turns the eye to the left, down, left as it grows (3,)
     opening: float  # of an open gripper [m]
     home: np.ndarray  # both arms, left first (n + m,)
+    couples: bool  # joints that follow others carry hands or eyes, as the second stage of a lift does
 
     def __init__(self, description: RobotDescription, model: Model):
         """Raises ConfigError in one line that names the key: what the model lacks or contradicts."""
         d, plant, index = description, model.plant, model.robot
         joint = {key: joint_named(plant, index, name, key) for key, name in named_joints(d)}
+        _check_room(joint)
         self.description, self.model = d, model
         self.opening = d.opening
         frame = frame_named(plant, index, d.base.frame, "base.frame")
@@ -123,11 +129,13 @@ class Robot:
         lift = [joint[f"lift.joints[{k}]"] for k in range(len(d.lift.joints))]
         gaze = {key: joint[f"gaze.{key}"] for key in ("waist", "tilt", "pan") if f"gaze.{key}" in joint}
         held = [*lift, *(gaze[key] for key in ("waist",) if key in gaze)]
-        rest = [*d.lift.home, *(0.0 for key in ("waist",) if key in gaze)]
+        rest = [*d.lift.home, *(_nearest_zero(gaze[key]) for key in ("waist",) if key in gaze)]
         speed = [*d.lift.speed, *(d.gaze.waist_speed for key in ("waist",) if key in gaze)]
         head = [gaze[key] for key in ("tilt", "pan") if key in gaze]
         self.posture = _joints(held, speed, rest)
-        self.torso = _joints([*held, *head], [*speed, *(d.gaze.speed for _ in head)], [*rest, *(0.0 for _ in head)])
+        self.torso = _joints(
+            [*held, *head], [*speed, *(d.gaze.speed for _ in head)], [*rest, *map(_nearest_zero, head)]
+        )
         _check_within(self.posture, "lift.home")
         _check_speeds("lift.speed", lift, d.lift.speed)
         for name, turning in gaze.items():
@@ -137,6 +145,7 @@ class Robot:
         self.home = _locked(np.concatenate([self.arms[side].home for side in SIDES]))
 
         self._plant, self._base_frame = plant, frame
+        self._check_base()
         self._follow = follower(plant, index, model.mimics)
         self._context = plant.CreateDefaultContext()
         self._eye = frame_named(plant, index, d.cameras["head_left"], "cameras.head_left")
@@ -153,6 +162,9 @@ class Robot:
             ].home
         self.follow(q)
         self._home_q = q
+        ways = [self._eye, *(frame_named(plant, index, f"{side}_grip", f"frames.{side}_grip") for side in SIDES)]
+        carrying = {inner.name() for way in ways for inner in _carriers(plant, index, way)}
+        self.couples = any(mimic.joint in carrying for mimic in model.mimics)
         self._chains = {side: self._chain(side, joint) for side in SIDES}
         self._plant.SetPositions(self._context, self._home_q)
         self._ends = [float(self._pose(chain.shoulder)[0, 3]) + chain.reach for chain in self._chains.values()]
@@ -250,7 +262,7 @@ class Robot:
         """The left eye in the base for the torso's joints -> (3, 4)."""
         q = self._home_q.copy()
         q[self._torso_q] = torso
-        self._plant.SetPositions(self._context, q)
+        self._put(q)
         return self._pose(self._eye)
 
     def X_GC(self, side: str) -> np.ndarray:
@@ -297,11 +309,11 @@ class Robot:
             far = X_BG[:, 3] - self._pose(chain.shoulder)[:, 3]
             if math.sqrt(far @ far) > chain.reach:
                 return None
-        plant, context, scratch, slots = self._plant, self._context, self._scratch, chain.q
+        put, scratch, slots = self._put, self._scratch, chain.q
 
         def evaluate(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             scratch[slots] = q
-            plant.SetPositions(context, scratch)
+            put(scratch)
             return self._pose(chain.grip), self._jacobian(chain)
 
         if near is not None:
@@ -357,8 +369,10 @@ class Robot:
             out |= dict(zip(self.arms[side].names, q))
         if opening is not None:
             out |= {gripper.joint: gripper.position(opening) for gripper in self.grippers.values()}
-        followers = {m.joint: m.multiplier * out[m.follows] + m.offset for m in self.model.mimics if m.follows in out}
-        return {name: float(value) for name, value in (out | followers).items()}
+        for mimic in self.model.mimics:  # a leader comes before its followers, which may lead others
+            if mimic.follows in out:
+                out[mimic.joint] = mimic.multiplier * out[mimic.follows] + mimic.offset
+        return {name: float(value) for name, value in out.items()}
 
     def slots(self, joints: Sequence[str]) -> np.ndarray:
         """Where these joints' positions stand in the positions of the model's plant."""
@@ -379,7 +393,13 @@ class Robot:
         scratch[chain.q] = q
         if posture is not None and len(posture):
             scratch[self._posture_q] = posture
-        self._plant.SetPositions(self._context, scratch)
+        self._put(scratch)
+
+    def _put(self, q: np.ndarray) -> None:
+        """Sets the context to q, in which joints that follow others may stand anywhere."""
+        if self.couples:
+            self._follow(q)
+        self._plant.SetPositions(self._context, q)
 
     def _pose(self, frame: Frame) -> np.ndarray:
         """X_BF as the context stands -> (3, 4)."""
@@ -391,7 +411,12 @@ class Robot:
         J: np.ndarray = self._plant.CalcJacobianSpatialVelocity(
             self._context, JacobianWrtVariable.kV, chain.grip, _ORIGIN, B, B
         )
-        return J[:, chain.v]
+        if not chain.followers:
+            return J[:, chain.v]
+        own = J[:, chain.v]
+        for k, v, ratio in chain.followers:
+            own[:, k] += ratio * J[:, v]
+        return own
 
     def follow(self, q: np.ndarray) -> None:
         """Puts the joints that follow others where they belong, in the plant's positions."""
@@ -415,13 +440,39 @@ class Robot:
         lengths = [float(np.linalg.norm(b - a)) for a, b in zip(points, points[1:])]
         slides = [inner.position_upper_limits()[0] - inner.position_lower_limits()[0] for inner in joints
                   if isinstance(inner, PrismaticJoint)]  # fmt: skip
+        ratios = {inner.name(): (k, 1.0) for k, inner in enumerate(joints)}  # whom each joint follows, and how fast
+        followers = []
+        for mimic in self.model.mimics:  # a leader comes before its followers, which may lead others
+            if mimic.follows not in ratios:
+                continue
+            k, ratio = ratios[mimic.follows]
+            ratios[mimic.joint] = k, ratio * mimic.multiplier
+            led = joint_named(plant, index, mimic.joint, "model: mimic")
+            if led in carried:
+                followers.append((k, led.velocity_start(), ratio * mimic.multiplier))
         return _Chain(
             _positions(joints),
             np.array([inner.velocity_start() for inner in joints]),
+            tuple(followers),
             grip,
             joints[0].frame_on_parent(),
             sum(lengths) + float(sum(slides)) + 1e-6,
         )
+
+    def _check_base(self) -> None:
+        """Base joints of the model's own are to move B as its odometry counts: x, y, heading."""
+        if not len(self.base):
+            return
+        context, place = self._plant.CreateDefaultContext(), (0.3, 0.2, 0.5)
+        q = np.array(self._plant.GetPositions(context))
+        q[self.slots(self.base.names)] = place
+        self._plant.SetPositions(context, q)
+        X_WB = self._base_frame.CalcPoseInWorld(context).GetAsMatrix34()
+        off = np.abs(X_WB - planar(*place))
+        off[2, 3] = 0.0  # a floor may be anywhere
+        names = ", ".join(self.base.names)
+        words = f"one that {names} move along x, along y and about z, from the world's origin"
+        require(bool(off.max() < _ON_WAY), "base.frame", words, self.description.base.frame)
 
     def _check_sides(self) -> None:
         self._plant.SetPositions(self._context, self._home_q)
@@ -536,6 +587,20 @@ def _group(joints: list[Joint], speed: list[float], home: list[float]) -> dict[s
     }
 
 
+def _check_room(joints: Mapping[str, Joint]) -> None:
+    """A joint whose limits leave it no room cannot do its part: a URDF without limits says so by [0, 0]."""
+    for key, joint in joints.items():
+        low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        require(low < high, key, f"a joint with room between its limits, [{low:g}, {high:g}]", joint.name())
+        slides = isinstance(joint, PrismaticJoint)
+        require(not slides or high - low < FAR, key, "a joint with limits, since it slides", joint.name())
+
+
+def _nearest_zero(joint: Joint) -> float:
+    """Where a joint of waist or head is at home."""
+    return float(min(max(0.0, joint.position_lower_limits()[0]), joint.position_upper_limits()[0]))
+
+
 def _check_within(group: Joints, key: str, values: np.ndarray | None = None) -> None:
     for k, value in enumerate(group.home if values is None else values):
         low, high = group.low[k], group.high[k]
@@ -574,9 +639,9 @@ def _arm(
     spec = d.arm(side)
     joints = [joint[f"arms.{side}.joints[{k}]"] for k in range(len(spec.joints))]
     work = _locked(np.array(spec.work or spec.home))
-    arm = Arm(**_group(joints, d.arm_speed, spec.home), work=work)
+    arm = Arm(**_group(joints, spec.speed or d.arm_speed, spec.home), work=work)
     _check_within(arm, f"arms.{side}.home")
-    _check_speeds("arm_speed", joints, d.arm_speed)
+    _check_speeds(f"arms.{side}.speed" if spec.speed else "arm_speed", joints, spec.speed or d.arm_speed)
     _check_within(arm, f"arms.{side}.work", work)
     return arm
 
