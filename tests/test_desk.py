@@ -198,6 +198,10 @@ def test_what_is_no_wav_file_is_refused_in_one_line(tmp_path):
         ([], "standard input must be a terminal"),
         (["--json"], "--json must be given with --say or --file"),
         (["--radio"], "--radio must be given with --file"),
+        (["--radio", "--file", "a.wav", "--say", "stop"], "--radio must be given without --say"),
+        (["--radio", "--file", "a.wav", "--voice", "wire"], "--radio must be given without --voice"),
+        (["--say", "  "], "--say must be 1 to 120 characters, got '  '"),
+        (["--say", "open " * 25], "--say must be 1 to 120 characters"),
         (["--file", "none.wav"], "--file: none.wav cannot be read"),
         (["--say", "stop", "nothing.yaml"], "nothing.yaml"),
         (["--say", "stop", "--set", "hardware.lcm_url=tcp://x"], "hardware.lcm_url"),
@@ -263,6 +267,21 @@ def test_a_script_says_its_words_waits_for_the_end_of_its_run_and_tells_it(monke
     assert [line["text"] for line in found["said"] if line["who"] == "you"] == ["robot, open the valve", "confirm"]
     elsewhere.sleep(0.1)
     assert elsewhere.state.holder == 0  # it has left
+
+
+def test_a_script_whose_words_are_lost_on_the_wire_exits_1(monkeypatch, capsys):
+    elsewhere = Elsewhere(monkeypatch)
+    elsewhere.take = elsewhere.program.take
+
+    def deaf(now):
+        """The program hears nothing that is said after the first sentence."""
+        found = elsewhere.take(now)
+        kept = tuple(one for one in found.packets if one.sequence <= 1) if found else ()
+        return OperatorPackets(found.time, found.count, kept) if found else None
+
+    elsewhere.program.take = deaf
+    code, told = script(capsys, "--say", "status", "--say", "robot, open the valve")
+    assert code == 1 and "the robot did not answer to robot, open the valve" in told.err
 
 
 def test_a_script_whose_words_are_refused_exits_1(monkeypatch, capsys):

@@ -14,6 +14,7 @@ from valve_drake.operator.desk_link import PATIENCE, SILENT, DeskLink
 from valve_drake.operator.grammar import LONGEST, Heard
 from valve_drake.operator.operator_link import MOST, OperatorLink
 from valve_drake.operator.wire import (
+    MOST_COUNTED,
     RATE,
     News,
     Sound,
@@ -152,11 +153,17 @@ def test_a_stop_goes_at_once_and_before_all_that_waits():
     assert not pair.desk.waiting
 
 
+def test_words_with_what_is_no_character_are_said_all_the_same():
+    pair = Pair().run()
+    pair.desk.say(Heard("robot \udcff open"))
+    assert pair.run().words()[0] == "robot ? open"
+
+
 def test_words_that_nobody_hears_are_given_up_and_said_to_be_so():
     pair = Pair()
     pair.desk.say(Heard("robot open"))
     pair.run(PATIENCE + 0.2, answer=False)
-    assert pair.desk.notes == ["not heard by the robot: robot open"]
+    assert pair.desk.notes == ["not heard by the robot: robot open"] and pair.desk.unheard == 1
     pair.run()
     assert pair.words() == []
 
@@ -201,7 +208,10 @@ def test_a_second_program_is_refused_and_a_desk_does_not_listen_to_it():
     other.tell(OperatorState(speaker=pair.desk.number, says="go"))
     pair.run()
     assert pair.desk.program == pair.program.bus.instance and pair.desk.state.says == ""
-    assert any("a second program answers" in note for note in pair.desk.notes)
+    for _ in range(30):
+        other.tell(OperatorState(speaker=pair.desk.number))
+        pair.run(0.2)
+    assert len([note for note in pair.desk.notes if "a second program answers" in note]) == 1
 
 
 def test_sound_reaches_the_program_and_no_more_is_kept_than_has_room():
@@ -249,6 +259,25 @@ def test_another_desks_sound_begins_anew():
             desk.sound(np.ones(1280, np.int16))
             pair.program.take(pair.time)
     assert sum(len(sound.samples) for sound in pair.program.sounds()) == 2 * 20 * 1280
+
+
+def test_a_desk_whose_first_messages_are_lost_is_heard_though_another_has_spoken_for_hours():
+    first, second, news = Tail(), Tail(), News()
+    for _ in range(100):
+        news.take(first.add(np.ones(1280, np.int16), 5.0))
+    sent = [second.add(np.full(1280, k, np.int16), 9.0) for k in range(10)]
+    assert news.take(sent[-1]).samples[-1] == 9
+
+
+def test_sound_goes_on_when_its_count_has_no_more_room():
+    tail, news = Tail(), News()
+    tail._count = MOST_COUNTED - 10 * 1280
+    got = []
+    for k in range(20):
+        image = sound_message(tail.add(np.full(1280, k, np.int16), 5.0 + k * 0.08))
+        sound = news.take(read_sound(type(image).decode(image.encode())))
+        got += [] if sound is None else [sound.samples]
+    assert np.array_equal(np.concatenate(got), np.repeat(np.arange(20), 1280))
 
 
 # ---------------------------------------------------------------- signatures, bad messages

@@ -53,9 +53,14 @@ def command(options: argparse.Namespace) -> int:
     from valve_drake.operator import ear
     from valve_drake.operator.desk import Desk
     from valve_drake.operator.desk_link import DeskLink
+    from valve_drake.operator.grammar import LONGEST
     from valve_drake.stations.bus import Bus
 
     require(not options.radio or options.file is not None, "--radio", "given with --file", options.radio)
+    for other in ("say", "voice", "json"):
+        require(not (options.radio and getattr(options, other)), "--radio", f"given without --{other}", options.radio)
+    for text in options.say:
+        require(0 < len(text.strip()) and len(text) <= LONGEST, "--say", f"1 to {LONGEST} characters", text)
     scripted = bool(options.say) or options.file is not None
     require(scripted or not options.json, "--json", "given with --say or --file", True)
     require(scripted or sys.stdin.isatty(), "standard input", "a terminal, or --say or --file given", "none")
@@ -170,7 +175,7 @@ def _send(link: "DeskLink", sound: "np.ndarray") -> int:
 def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace, sound: "np.ndarray | None") -> int:
     """Says all that was given, and waits for the end of a run that it began: whoever leaves loses the link.
 
-    Exit 0: nothing was refused, and the valve was turned if it was asked for.
+    Exit 0: all was heard, nothing that --say says was refused, and the valve was turned if it was asked for.
     """
     from valve_drake.operator.desk import transcript
     from valve_drake.operator.ear import PIECE, pieces
@@ -207,7 +212,7 @@ def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace,
             raise OperationFailed(f"the robot does not listen to this desk: {who}")
         for text in options.say:
             desk.say(Heard(text, typed=True))
-            if not until(lambda: not link.waiting, ANSWER):
+            if not until(lambda: not link.waiting, ANSWER) or link.unheard:
                 raise OperationFailed(f"the robot did not answer to {text}")
             outcomes.append(link.state.outcome)
         if sound is not None:
@@ -223,7 +228,7 @@ def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace,
             until(lambda: False, 4 * POLL)
     state = link.state
     refused = [outcome for outcome in outcomes if outcome in ("refused", "ignored")]
-    good = not refused and link.commanding and not (begun and state.verdict != "turned")
+    good = not (refused or link.unheard) and link.commanding and not (begun and state.verdict != "turned")
     if options.json:
         said = [{"time_s": line.time, "who": line.who, "text": line.text} for line in desk.lines]
         facts = {"mode": state.mode, "done": state.done, "verdict": state.verdict, "reason": state.reason}

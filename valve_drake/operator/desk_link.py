@@ -35,6 +35,7 @@ class DeskLink:
         self.state = OperatorState()  # what the robot answered last
         self.notes: list[str] = []  # for the operator, to be fetched
         self.dropped = 0  # bad messages
+        self.unheard = 0  # sentences that were given up
         self._heard_at = float("-inf")
         self._current: OperatorPacket | None = None  # is said until the program has heard it
         self._queue: list[tuple[float, Heard]] = []  # when it was said, and what
@@ -43,6 +44,7 @@ class DeskLink:
         self._refused = False
         self._tail = Tail()
         self._told_others = False
+        self._stranger_at = float("-inf")  # when another program than ours was heard last
         bus.listen(CONTROLLER, self._hear, between=OPERATOR)
 
     @property
@@ -117,10 +119,10 @@ class DeskLink:
             self.program = 0
             self.notes.append("the program is not heard any more")
         if self._current is not None and now - self._current.said > PATIENCE:
-            self.notes.append(f"not heard by the robot: {self._current.words}")
+            self._give_up(self._current.words)
             self._current = None
         while self._queue and now - self._queue[0][0] > PATIENCE:
-            self.notes.append(f"not heard by the robot: {self._queue.pop(0)[1].text}")
+            self._give_up(self._queue.pop(0)[1].text)
         if self._current is None and self._queue and self.program:
             self._begin(*self._queue.pop(0))
         self.bus.announce(OPERATOR)
@@ -130,6 +132,10 @@ class DeskLink:
         self._told_others = others
         if now - self._sent_at >= ANNOUNCED:
             self._send(now)
+
+    def _give_up(self, words: str) -> None:
+        self.unheard += 1
+        self.notes.append(f"not heard by the robot: {words}")
 
     def leave(self) -> None:
         """Gives the robot's ear back: the end of this desk."""
@@ -168,8 +174,11 @@ class DeskLink:
             self.dropped += 1
             return
         if self.program not in (0, program):
-            if self.clock() - self._heard_at <= PRESENT:
-                self.notes.append(f"a second program answers on this bus ({tag(program)}): it is not listened to")
+            now = self.clock()
+            if now - self._heard_at <= PRESENT:
+                if now - self._stranger_at > SILENT:  # else it has been told
+                    self.notes.append(f"a second program answers on this bus ({tag(program)}): it is not listened to")
+                self._stranger_at = now
                 return
             self._queue, self._current = [], None  # what was meant for the other one
         self.program, self.state, self._heard_at = program, state, self.clock()

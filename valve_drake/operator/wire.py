@@ -15,6 +15,7 @@ from valve_drake.stations.lcm_channels import LONGEST_NAME, WrongMessage, from_u
 RATE = 16000  # of the sound [Hz]
 MOST_SAMPLES = 16000  # in one message
 AGAIN = 0.4  # of sound that every message repeats: a bus keeps one message a channel until somebody asks for it [s]
+MOST_COUNTED = 2**31 - 1  # samples of one sender, 37 hours: what the message's number has room for
 LARGEST = 2.0**53  # whole numbers up to here are exact
 _WORDS = "words"
 _TEXTS = tuple(f.name for f in dc.fields(OperatorState) if f.type is str)
@@ -40,6 +41,8 @@ class Tail:
 
     def add(self, samples: np.ndarray, time: float) -> Sound:
         """What is to be sent when these (n,) have been heard; time: of the first of them [s]."""
+        if self._count + len(samples) > MOST_COUNTED:  # the count begins anew, as another sender's does
+            self._samples, self._count = np.zeros(0, np.int16), 0
         self._count += len(samples)
         joined = np.concatenate([self._samples, samples])
         before = len(joined) - len(samples)
@@ -54,8 +57,9 @@ class News:
         self._next = 0  # the sample that follows the last one
 
     def take(self, sound: Sound) -> Sound | None:
-        """The new part; None: there is none. A count that begins anew is another sender's."""
-        if sound.sequence == 0 and self._next > MOST_SAMPLES:
+        """The new part; None: there is none. A count that begins anew, or is far behind, is another sender's."""
+        behind = self._next - sound.sequence - len(sound.samples)
+        if behind > MOST_SAMPLES or (sound.sequence == 0 and self._next > MOST_SAMPLES):
             self._next = 0
         old = max(self._next - sound.sequence, 0)
         if old >= len(sound.samples):
@@ -65,8 +69,10 @@ class News:
 
 
 def _named(values: Mapping[str, float], texts: Mapping[str, str]) -> lcmt_drake_signal:
-    """Numbers under their names, and texts as 1 under `<name>: <text>`; a text that is too long is cut."""
-    return signal(dict(values) | {f"{name}: {text}"[:LONGEST_NAME]: 1.0 for name, text in texts.items() if text})
+    """Numbers under their names, and texts as 1 under `<name>: <text>`; a text that is too long is cut, and what is no
+    character (a name's bytes that are not UTF-8) is a question mark."""
+    named = (f"{name}: {text}"[:LONGEST_NAME] for name, text in texts.items() if text)
+    return signal(dict(values) | {name.encode("utf-8", "replace").decode(): 1.0 for name in named})
 
 
 def _read(message: lcmt_drake_signal, names: tuple[str, ...]) -> tuple[dict[str, float], dict[str, str]]:
