@@ -19,7 +19,7 @@ from valve_drake.frames import compose, make, planar, rot_z
 from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.recording.signals import commanded
 from valve_drake.robot import description, model
-from valve_drake.robot.robot import Robot
+from valve_drake.robot.robot import Gripper, Robot
 from valve_drake.scenario import load, resolve
 from valve_drake.stations.contract import check_contract, vectors
 
@@ -188,6 +188,21 @@ def test_a_rotary_gripper_opens_by_the_sine_of_its_joint(tmp_path):
     for angle in (0.0, 0.2, 0.5):
         assert robot.grippers[LEFT].opening(angle) == pytest.approx(2 * 0.09 * np.sin(angle), abs=2e-5)
         assert robot.grippers[LEFT].position(2 * 0.09 * np.sin(angle)) == pytest.approx(angle, abs=2e-4)
+
+
+def test_a_gripper_reads_between_its_positions_to_the_bit_of_numpy_and_not_a_number_as_that():
+    rng = np.random.default_rng(0)
+    positions, levers = np.sort(rng.normal(size=65)), rng.normal(size=65)
+    rising = np.sort(rng.normal(size=65))
+    for openings in (rising, rising[::-1]):
+        gripper = Gripper("joint", positions, openings, levers)
+        for x in [*rng.uniform(positions[0], positions[-1], 500), *positions]:
+            assert gripper.lever(float(x)) == np.interp(x, positions, levers)
+            assert gripper.opening(float(x)) == np.interp(x, positions, openings)
+        for x in [*rng.uniform(rising[0], rising[-1], 500), *rising]:
+            assert gripper.position(float(x)) == np.interp(x, rising, positions[np.argsort(openings)])
+        assert gripper.lever(positions[0] - 1) == levers[0] and gripper.lever(positions[-1] + 1) == levers[-1]
+        assert np.isnan(gripper.lever(np.nan)) and np.isnan(gripper.opening(np.nan))
 
 
 def test_a_gripper_whose_joint_falls_as_it_opens(tmp_path):

@@ -154,6 +154,7 @@ class PlantSystem(PythonSystem):
         self._scratch = self.diagram.CreateDefaultContext()
         self._lock = threading.Lock()  # of the scratch: two threads may advance two Contexts
         self._inner = self.plant.GetMyMutableContextFromRoot(self._scratch)
+        self._after = self.plant.AllocateDiscreteVariables()
         desired = np.zeros(2 * len(joints))  # [q_d; v_d] of the robot's actuators
         self._fixed_desired, self._desired = self._fix("desired", desired)
         self._fixed_feed_forward, self._feed_forward = self._fix("feed_forward", np.zeros(len(joints)))
@@ -341,8 +342,8 @@ class PlantSystem(PythonSystem):
             for (_, fixed, kept), goal in zip(self._driven_rails, self._rail_goals(self._inner, x)):
                 fixed.GetMutableData()
                 kept[:] = goal
-            after = self.diagram.EvalUniquePeriodicDiscreteUpdate(scratch)
-            x = after.value(0)
+            self.plant.CalcForcedDiscreteVariableUpdate(self._inner, self._after)
+            x = self._after.value(0)
             if k < STEPS - 1:
                 scratch.SetDiscreteState(x)
         # The last step is not taken in the scratch, so what the outputs need of it is in the cache.
