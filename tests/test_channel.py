@@ -53,3 +53,19 @@ def test_gamma_of_an_ordinary_camera_is_undone():
     wrong = fit(encoded, true_quad(X))
     inward = [[np.mean(distances(q, X)[q.side == k]) for k in range(4)] for q in (straight, wrong)]
     assert np.abs(inward[0]).max() < 0.02 < np.abs(inward[1]).max()
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4])
+def test_a_colour_that_is_not_clipped_counts_by_its_contrast_beside_the_sides(turn):
+    """In bright light a plate is as red as the marker, and the other colours are clipped; the wall behind is not."""
+    X = facing(1.9, 0.2, 0.2, turn)
+    canvas = Canvas(HEAD.left)
+    canvas.rectangle(X, (155, 175, 195), (0.4, 0.4))
+    canvas.disc(X, (231, 256, 262), (0.07, 0.07))
+    canvas.rectangle(X, (237, 18, 17), (0.049, 0.05))
+    quad = fit(canvas.finish(np.random.default_rng(0), 2.0), true_quad(X))
+    assert quad.reason == ""
+    off = distances(quad, X)
+    # What clipping moves the edges by is what is claimed of it.
+    assert quad.bias.min() > 0.02
+    assert max(abs(off[quad.side == k].mean()) for k in range(4)) < 3 * quad.bias.max()

@@ -29,7 +29,7 @@ def mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np.
     """One linear channel, float32: about 1 inside, about 0 outside; the contrast it has [grey levels]; and the share
     of clipped light beside each side that is in it (4,).
 
-    A colour whose light is clipped takes no part if the others have contrast enough.
+    A colour whose light is clipped takes no part if the others have contrast enough beside every side.
     """
     clipped = _clipped(part, corners)
     step = 2 if (corners.max(0) - corners.min(0)).max() > HALF_RESOLUTION_SIZE else 1
@@ -46,10 +46,14 @@ def mix(part: np.ndarray, corners: np.ndarray, config: SidesConfig) -> tuple[np.
     difference = _between(core, ring, np.full(3, True), config)
     lost = np.zeros(4)
     if clipped is not None:
-        whole = _between(core, ring, clipped.mean(0) <= _CLIPPED_SHARE, config)
-        if np.linalg.norm(whole) > 2 * config.min_contrast:
+        share, beside = clipped
+        inner, outer = part[beside].astype(np.float32)
+        whole = _between(core, ring, share.mean(0) <= _CLIPPED_SHARE, config)
+        # The ring may reach beyond what lies beside the sides, so it is asked there, of most of each side.
+        across = np.median((inner - outer) @ whole, axis=1)
+        if across.min() > 2 * config.min_contrast * np.linalg.norm(whole):
             difference = whole
-        lost = clipped @ np.abs(difference) / max(float(np.abs(difference).sum()), 1e-9)
+        lost = share @ np.abs(difference) / max(float(np.abs(difference).sum()), 1e-9)
     contrast = float(np.linalg.norm(difference))
     if contrast < 1e-3:
         return part[:, :, 0], 0.0, lost
@@ -73,8 +77,9 @@ def _within(values: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.minimum(np.maximum(values, low), high)
 
 
-def _clipped(part: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
-    """The share of clipped pixels beside each side, inside or outside, whichever is larger, in each colour: (4, 3).
+def _clipped(part: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None:
+    """The share of clipped pixels beside each side, inside or outside, whichever is larger, in each colour: (4, 3);
+    and the rows and columns (2, 4, n) of those pixels, inside and outside.
 
     None if there are none. An edge that is fitted to a clipped level lies off, towards the level that is not clipped.
     """
@@ -83,12 +88,13 @@ def _clipped(part: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
     along = corners[NEXT] - corners
     lengths = np.sqrt((along * along).sum(1))
     inward = np.stack([-along[:, 1], along[:, 0]], -1) / lengths[:, None]
-    beside = min(max(0.12 * float(lengths.min()), 3.0), 6.0) * np.array([[[[1.0]]], [[[-1.0]]]])
-    at = corners[:, None] + along[:, None] * _ALONG[:, None] + beside * inward[:, None]  # (2, 4, n, 2)
+    off = min(max(0.12 * float(lengths.min()), 3.0), 6.0) * np.array([[[[1.0]]], [[[-1.0]]]])
+    at = corners[:, None] + along[:, None] * _ALONG[:, None] + off * inward[:, None]  # (2, 4, n, 2)
     u, v = np.rint(at).astype(int).transpose(3, 0, 1, 2)
-    values = part[_within(v, 0, part.shape[0] - 1), _within(u, 0, part.shape[1] - 1)]
+    beside = _within(v, 0, part.shape[0] - 1), _within(u, 0, part.shape[1] - 1)
+    values = part[beside]
     share = ((values >= _BRIGHT) | (values <= _DARK)).mean(2).max(0)
-    return share if share.any() else None
+    return (share, beside) if share.any() else None
 
 
 def every_nth(image: np.ndarray, step: int) -> np.ndarray:
