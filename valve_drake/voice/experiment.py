@@ -21,6 +21,8 @@ from valve_drake.checks import ConfigError
 from valve_drake.operator.grammar import MOVES, NUMBERS, SURE, Heard, Intent, Kind, Talk, converse, parse
 from valve_drake.voice import radio, words
 from valve_drake.voice.embedding import BLOCK, STEP, Batch, pcm
+from valve_drake.voice.hindsight import Hindsight
+from valve_drake.voice.judge import Judge
 from valve_drake.voice.radio import RATE, Radio
 from valve_drake.voice.recogniser import Memory, Recogniser, WordNet, step
 from valve_drake.voice.synthesis import Speaker, installed, say
@@ -53,6 +55,8 @@ CHOOSING = (
     Speaker("pico", "en-US", 1.1, size=1.2),
     Speaker("pico", "en-US", 0.9, 80, size=1.1),
     Speaker("pico", "en-US", 1.15, 115, size=0.95),
+    Speaker("hibari", "heart"),
+    Speaker("hibari", "heart", 1.15, size=1.15),
 )
 CHOOSING_PROSE = ("wisdom", "work", "platitudes", "songs-poems")
 FORTUNES = Path("/usr/share/games/fortunes")
@@ -84,16 +88,21 @@ def commands(rng: np.random.Generator) -> list[str]:
 
 
 class Ear:
-    """What the recogniser makes of whole sounds, faster than `Recogniser` and equal to it but for rounding."""
+    """What the recogniser makes of whole sounds, faster than `Recogniser` and equal to it but for rounding.
+
+    Raises ConfigError where the extra `voice` is not installed, the second ear included.
+    """
 
     def __init__(self, net: WordNet | None = None) -> None:
         self.net, self.batch = net or WordNet.load(), Batch()
+        self.judge = Judge()
 
     def hear(self, samples: np.ndarray) -> list[tuple[float, Heard]]:
         """(n,) int16 -> when it was decided [s], and what was heard."""
-        memory, out = Memory(), []
+        memory, sound, out = Memory(), Hindsight(self.judge), []
         for k, p in enumerate(self.net.probabilities(self.batch.rows(samples))):
-            memory, heard = step(memory, p)
+            loud = sound.push(samples[k * BLOCK : (k + 1) * BLOCK])
+            memory, heard = step(memory, p, loud, sound.second)
             out += [((k + 1) * STEP, each) for each in heard]
         return out
 

@@ -9,28 +9,35 @@ forward recursion of connectionist temporal classification). A sentence counts f
 have been said, not only for what it is beside the other sentences of the grammar: speech that was not meant for the
 robot is refused by that. `stop` does not wait for the end of a sentence, nor for its beginning; `confirm` not for the
 end.
+
+Where the packages of judge.py are installed, a second ear is asked: at a sentence's end, how likely the network's
+likeliest sentences are in its sound; at a word that may be `stop`, whether it is. Without them the network decides.
 """
 
 import dataclasses as dc
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from valve_drake import resources
+from valve_drake import console, resources
 from valve_drake.checks import ConfigError, require
 from valve_drake.operator import grammar
 from valve_drake.operator.grammar import SURE, Heard
+from valve_drake.voice import judge as judges
 from valve_drake.voice.embedding import BLOCK, ROW, STEP, Stream
+from valve_drake.voice.hindsight import Hindsight
+from valve_drake.voice.judge import Judge
 from valve_drake.voice.radio import RATE
 from valve_drake.voice.words import BLANK, CLASSES, INDEX, OTHER, WORDS, spelt
 
 # Words without which a sentence means the same; they may stand anywhere, or be missed.
 FILLERS = ("the", "by", "please", "now", "and", "way")
-PAUSE = 10  # steps without a word that end a sentence: 0.8 s; raise it for speakers who halt between words
+PAUSE = 10  # steps in which nobody speaks that end a sentence: 0.8 s; raise it for speakers who halt between words
+WORDLESS = 20  # steps without a word that end it too, however loud they are: 1.6 s; raise it for slow speakers in noise
 LONGEST = 100  # steps of a sentence: 8 s
 STOP_SURE = 0.5  # probability from which `stop` is heard; lower: fewer are missed, more are heard in other words
 CONFIRM_SURE = 0.2  # of `confirm`; lower: fewer are missed, more other words confirm a move that was read back
@@ -38,6 +45,21 @@ SENTENCE_SURE = 0.5  # of a meaning, within the grammar and FOREIGN; lower: fewe
 WAKE_SURE = 0.95  # of the wake phrase alone, against all other speech; lower: other speech is listened to more often
 FOREIGN = 0.07  # weight of all that is no sentence of the grammar; higher: less other speech is taken for one
 DEAF = 6  # steps after a `stop` or `confirm` in which the same word is not heard again
+ASKED = 10  # sentences that the second ear is asked about; more cost time (20 ms each)
+# ln of a sentence's weight: NETWORK * ln of the network's probability + SECOND * ln of the second ear's + WORD * words.
+NETWORK, SECOND = 0.35, 0.5  # shares of the two ears' evidence; both above 1 would count what they have in common twice
+WORD = 1.0  # for each word, since every word makes a sentence less likely to both; lower: fewer long ones, more short
+LOWEST = -20.0  # ln of the network's probability counts as no less, or the second ear could not mend what it missed
+ALONE = -2.0  # of the wake phrase alone, with which the others begin; lower: a longer sentence is likelier
+LATE_STOP = -4.5  # instead of the network's part where `stop` was missed; lower: fewer are found, fewer false ones
+ELSE = -5.0  # of all that is no sentence of the grammar; higher: less other speech is taken for one
+LEAD = 0.8  # of sound before the first word that was noticed: a word is noticed at its end [s]
+FILLED = 6.0  # to which silence fills a sentence up, what the second ear is used to; raise it for longer ones [s]
+# `stop`: the network alone is believed from STOP_SURE; beside a second ear it is asked between these two.
+STOP_MAYBE = 0.08  # lower: fewer are missed, the second ear is asked more often (30 ms each)
+STOP_CERTAIN = 0.97  # lower: fewer are missed, more are heard in other words
+STOP_LIKELY = -4.0  # ln of the second ear's probability from which it is one; lower: as above
+STOP_BACK, STOP_FILLED = 1.0, 3.0  # of sound that it is asked about, and to which silence fills it up [s]
 _EARLY = 0.1  # probability of `confirm` from which it is asked whether the sentence is no more than that
 
 
@@ -220,6 +242,59 @@ def score(probability: float, sure: float) -> float:
     return min(probability, 1.0) ** (math.log(SURE) / math.log(sure)) if sure != SURE else min(probability, 1.0)
 
 
+class SecondEar(Protocol):
+    """The sound up to now, and how likely sentences are in it (hindsight.Hindsight)."""
+
+    def likelihoods(self, back: float, texts: Sequence[str], seconds: float) -> np.ndarray:
+        """Logarithms (n,) of texts, as judge.written has them, in the last `back` seconds, filled up to `seconds`."""
+        ...
+
+
+def judged(p: np.ndarray, second: SecondEar, back: float) -> tuple[str, float]:
+    """The likeliest meaning's likeliest sentence by both ears, and the meaning's probability.
+
+    p: (steps, CLASSES) of the sentence. back: how long ago its sound begins [s].
+    """
+    known = whole_grammar()
+    each = sentence_probabilities(p, known)
+    chosen = np.argsort(-each, kind="stable")[:ASKED]
+    texts = [*(known.texts[k] for k in chosen), "stop", f"{grammar.WAKE} stop"]
+    spellings = [judges.written(text) for text in texts]
+    found = iter(second.likelihoods(back, [one for all_ in spellings for one in all_], FILLED))
+    heard = np.array([np.logaddexp.reduce([next(found) for _ in all_]) for all_ in spellings])
+    network = np.append(np.maximum(np.log(np.maximum(each[chosen], 1e-300)), LOWEST) * NETWORK, [LATE_STOP] * 2)
+    network += [ALONE * (text == grammar.WAKE) for text in texts]
+    weights = network + SECOND * heard + WORD * np.array([len(text.split()) for text in texts])
+    meanings = np.append(known.meanings[chosen], [known.meanings.max() + 1] * 2)
+    total = {m: float(np.logaddexp.reduce(weights[meanings == m])) for m in meanings.tolist()}
+    meaning = max(total, key=lambda m: total[m])
+    best = int(np.where(meanings == meaning, weights, -np.inf).argmax())
+    return texts[best], math.exp(total[meaning] - float(np.logaddexp.reduce([*total.values(), ELSE])))
+
+
+def _sentence(words: np.ndarray, heard: str, second: SecondEar | None, back: float) -> tuple[str, float]:
+    """What a sentence that is complete comes to: its text, and its score. heard: its transcript."""
+    if second is not None:
+        text, probability = judged(words, second, back)
+        return text if probability >= SURE else heard, probability
+    text, probability = best_sentence(words, whole_grammar(), FOREIGN)
+    needed = SENTENCE_SURE
+    if text == grammar.WAKE:  # alone, it opens the ear to all that follows
+        probability, needed = best_sentence(words, whole_grammar())[1], WAKE_SURE
+    return text if probability >= needed else heard, score(probability, needed)
+
+
+def _stop(probability: float, second: SecondEar | None) -> float:
+    """How sure it is that `stop` has just been said, as a score. probability: the network's."""
+    if second is None or probability >= STOP_CERTAIN:
+        return score(probability, STOP_SURE)
+    if probability < STOP_MAYBE:
+        return 0.0
+    spellings = [*judges.written("stop"), *judges.written(f"{grammar.WAKE} stop")]
+    found = float(second.likelihoods(STOP_BACK, spellings, STOP_FILLED).max())
+    return 1 / (1 + math.exp(STOP_LIKELY - found))
+
+
 def _without(p: np.ndarray, words: list[str]) -> np.ndarray:
     """The probabilities (CLASSES,) with those of these words given to BLANK."""
     if not words:
@@ -235,26 +310,36 @@ def _without(p: np.ndarray, words: list[str]) -> np.ndarray:
 class Memory:
     """time: steps so far. said: the probabilities since the sentence began, oldest first; empty: nobody speaks.
 
-    quiet: steps since the last word. before: the probabilities of the last step. deaf: steps for which `stop` and
-    `confirm` are not heard again.
+    quiet: steps since somebody spoke. wordless: since the last word, within the sentence. since: the step before which
+    all sound belongs to what was heard already. before: the probabilities of the last step. deaf: steps for which
+    `stop` and `confirm` are not heard again.
     """
 
     time: int = 0
     said: tuple[np.ndarray, ...] = ()
     quiet: int = 0
+    wordless: int = 0
+    since: int = 0
     before: np.ndarray | None = None
     deaf: tuple[int, int] = (0, 0)
 
 
-def step(m: Memory, p: np.ndarray) -> tuple[Memory, tuple[Heard, ...]]:
-    """The probabilities of the next 80 ms (CLASSES,) -> what was heard in them. begin and end: [s] of the stream."""
+def step(
+    m: Memory, p: np.ndarray, loud: bool = False, second: SecondEar | None = None
+) -> tuple[Memory, tuple[Heard, ...]]:
+    """The probabilities of the next 80 ms (CLASSES,) -> what was heard in them. begin and end: [s] of the stream.
+
+    loud: somebody speaks in them, ours or not. second: the second ear, if there is one.
+    """
     deaf_stop, deaf_confirm = (max(d - 1, 0) for d in m.deaf)
     p = _without(p, [word for word, deaf in (("stop", deaf_stop), ("confirm", deaf_confirm)) if deaf])
     before = p if m.before is None else m.before
     idle = p[BLANK] + sum(p[INDEX[word]] for word in FILLERS) > 0.5
-    said = (*m.said, p) if m.said or not idle else ()
-    quiet = m.quiet + 1 if idle else 0
-    time = m.time + 1
+    active = loud or not idle
+    said = (*m.said, p) if m.said or active else ()
+    quiet = 0 if active else m.quiet + 1
+    wordless = m.wordless + 1 if idle and m.said else 0
+    time, since = m.time + 1, m.since
     end = (time - quiet) * STEP
     begin = (time - max(len(said), 1)) * STEP
 
@@ -262,26 +347,24 @@ def step(m: Memory, p: np.ndarray) -> tuple[Memory, tuple[Heard, ...]]:
         return float(1 - (1 - p[INDEX[word]]) * (1 - before[INDEX[word]]))
 
     out: list[Heard] = []
-    stop = spike("stop")
-    if stop >= STOP_SURE:
-        out.append(Heard("stop", score(stop, STOP_SURE), begin, time * STEP))
-        said, quiet, deaf_stop, p = (), 0, DEAF, _without(p, ["stop"])
+    stop = _stop(spike("stop"), second)
+    if stop >= SURE:
+        out.append(Heard("stop", stop, begin, time * STEP))
+        said, quiet, since, deaf_stop, p = (), 0, time, DEAF, _without(p, ["stop"])
     elif spike("confirm") > _EARLY and said:
         text, probability = best_sentence(np.stack(said), _confirms())
         if probability >= CONFIRM_SURE:
             out.append(Heard(text, score(probability, CONFIRM_SURE), begin, time * STEP))
-            said, quiet, deaf_confirm, p = (), 0, DEAF, _without(p, ["confirm"])
-    if said and (quiet >= PAUSE or len(said) >= LONGEST):
+            said, quiet, since, deaf_confirm, p = (), 0, time, DEAF, _without(p, ["confirm"])
+    if said and (quiet >= PAUSE or wordless >= WORDLESS or len(said) >= LONGEST):
         words = np.stack(said)
         heard = transcript(words)
         if heard.strip(". "):
-            text, probability = best_sentence(words, whole_grammar(), FOREIGN)
-            needed = SENTENCE_SURE
-            if text == grammar.WAKE:  # alone, it opens the ear to all that follows
-                probability, needed = best_sentence(words, whole_grammar())[1], WAKE_SURE
-            out.append(Heard(text if probability >= needed else heard, score(probability, needed), begin, end))
+            back = min(len(said) * STEP + LEAD, (time - since) * STEP)
+            out.append(Heard(*_sentence(words, heard, second, back), begin, end))
+            since = time - PAUSE // 2
         said, quiet = (), 0
-    return Memory(time, said, quiet, p, (deaf_stop, deaf_confirm)), tuple(out)
+    return Memory(time, said, quiet, wordless, since, p, (deaf_stop, deaf_confirm)), tuple(out)
 
 
 # ---------------------------------------------------------------- the whole, on a stream
@@ -290,11 +373,15 @@ def step(m: Memory, p: np.ndarray) -> tuple[Memory, tuple[Heard, ...]]:
 class Recogniser:
     """Hears a stream of sound: pieces of any length, 16-bit samples at RATE. The same samples give the same words.
 
+    Without the packages of the second ear it hears with the network alone, and says so.
     Raises ConfigError where pyopen-wakeword is not installed.
     """
 
     def __init__(self, net: WordNet | None = None) -> None:
         self._stream, self._net = Stream(), (net or WordNet.load()).start()
+        if not judges.installed():
+            _say_what_is_missing()
+        self._sound = Hindsight(Judge() if judges.installed() else None)
         self._rest = np.zeros(0, np.int16)
         self._memory = Memory()
         self.probabilities = np.zeros(CLASSES, np.float32)  # of the newest step: scores for a log
@@ -311,12 +398,20 @@ class Recogniser:
         out: list[Heard] = []
         used = 0
         while len(rest) - used >= BLOCK:
-            self.probabilities = self._net(self._stream.push(rest[used : used + BLOCK]))
-            self._memory, heard = step(self._memory, self.probabilities)
+            block = rest[used : used + BLOCK]
+            self.probabilities = self._net(self._stream.push(block))
+            self._memory, heard = step(self._memory, self.probabilities, self._sound.push(block), self._sound.second)
             out += heard
             used += BLOCK
         self._rest = rest[used:].copy()
         return out
+
+
+@functools.cache
+def _say_what_is_missing() -> None:
+    console.complain(
+        "the second ear is not installed, fewer commands will be understood: pip install 'valve-drake[voice]'"
+    )
 
 
 def hear(samples: np.ndarray, net: WordNet | None = None) -> list[Heard]:
