@@ -325,6 +325,17 @@ def test_a_command_that_is_not_finite_is_refused_and_only_that_group_holds(group
     assert all(np.all(np.isfinite(v)) for v in outputs(bench.memory).values())
 
 
+@pytest.mark.parametrize("group", ["torso", "left_arm", "right_arm"])
+@pytest.mark.parametrize("more", [-1, 1])
+def test_a_command_of_another_number_of_joints_is_refused_and_only_that_group_holds(group, more):
+    bench = Bench(Mode.ROUGH_APPROACH)
+    count = bench.memory.bounds.parts[group].stop - bench.memory.bounds.parts[group].start
+    report = bench.tick(**{group: np.full(count + more, 0.3)})
+    assert report.refused == (f"{group}: {count + more} values, not {count}",)
+    assert [s == "hold" for s in report.source] == [g == group for g in GROUPS]
+    assert {port: len(v) for port, v in outputs(bench.memory).items()} == {p: len(v) for p, v in INITIAL.items()}
+
+
 def test_a_negative_force_limit_is_refused():
     bench = Bench()
     assert bench.tick(left_gripper=np.array([0.05, -1.0])).refused == ("left_gripper: force limit -1.0 N",)

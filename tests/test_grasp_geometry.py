@@ -8,9 +8,9 @@ from robot_facts import ROBOT
 
 from valve_drake import resources
 from valve_drake.behaviors import arc_search
-from valve_drake.behaviors.grasp_geometry import Turn, standoff
+from valve_drake.behaviors.grasp_geometry import Turn, pairs, standoff
 from valve_drake.behaviors.questions import UNITS, Questions
-from valve_drake.behaviors.stance_config import StanceConfig
+from valve_drake.behaviors.stance_config import MAX_PLACES, StanceConfig
 from valve_drake.behaviors.stance_search import FEW, Stances
 from valve_drake.behaviors.taught import load_taught
 from valve_drake.checks import ConfigError
@@ -20,7 +20,7 @@ from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
-from valve_drake.valve.valve import Valve, angle_turned, turned
+from valve_drake.valve.valve import HandleConfig, Valve, angle_turned, turned
 
 VALVE = Valve()
 CONFIG = StanceConfig()
@@ -257,6 +257,22 @@ def test_bad_config_is_refused_by_name(changes):
 def test_distances_that_the_robot_does_not_have_are_refused_by_name(changes):
     with pytest.raises(ConfigError, match=f"stance.{next(iter(changes))} must be at"):
         stances(**changes)
+
+
+def test_arms_that_reach_far_are_tried_at_as_many_distances_as_there_may_be():
+    tried = StanceConfig().distances((0.6, 1.9))
+    assert len(tried) == MAX_PLACES and tried[[0, -1]] == pytest.approx([0.6, 1.9])
+    assert StanceConfig().distances((0.7, 0.84)) == pytest.approx(np.arange(0.7, 0.85, 0.02))
+    with pytest.raises(ConfigError, match=r"stance.distance_step must be at least 0.0333: 40 distances, got 0.03"):
+        StanceConfig(distance_step=0.03).distances((0.6, 1.9))
+
+
+def test_hands_never_hold_two_handles_of_which_one_is_before_the_other():
+    """The line between them, along the axis, would not tell how the valve is turned."""
+    handles = [HandleConfig(xyz=place) for place in ([0.15, 0.0, 0.0], [0.15, 0.0, -0.2], [-0.15, 0.0, 0.0])]
+    valve = dc.replace(VALVE, model="", handles=handles)
+    held = {(pair["left"].handle, pair["right"].handle) for group in pairs(valve, valve_at(1.0), 1.0) for pair in group}
+    assert held == {(0, 2), (2, 0), (1, 2), (2, 1)}
 
 
 def test_a_robot_that_does_not_say_where_it_stands_tries_from_its_footprint_to_its_reach():

@@ -34,6 +34,27 @@ def test_speed_and_acceleration_stay_within_their_limits(size):
         assert np.mean((lead[1:] | push)[inside]) > 0.95
 
 
+@pytest.mark.parametrize("size", [0.05, 0.5, 2.0])
+def test_no_joint_is_faster_than_its_own_limit_and_one_of_them_is_as_fast(size):
+    limits = np.array([0.1, 2.0, 0.5, 0.4, 3.0, 0.9] * 2)
+    points = random_points(np.random.default_rng(3), 4, size)
+    points = np.vstack([points, points[-1:], points[-1:] + np.eye(12)[1]])  # a leg without length; one of a fast joint
+    path = Path(points, 1.0, SPEED, ACCELERATION, limits)
+    dt = path.end() / 20000
+    q = np.array([path.sample(t) for t in np.arange(path.start, path.end() + dt, dt)])
+    speed = np.abs(np.diff(q, axis=0)) / dt
+    most = np.minimum(limits, SPEED)
+    assert (speed <= most * (1 + 1e-9)).all() and speed[:, 1].max() == pytest.approx(SPEED)
+    assert size < 0.5 or speed[:, 0].max() > 0.98 * limits[0]
+    assert q[-1] == pytest.approx(points[-1])
+
+
+def test_limits_that_no_joint_needs_change_no_leg():
+    points = random_points(np.random.default_rng(4), 6, 0.6)
+    plain = Path(points, 0.0, SPEED, ACCELERATION).durations()
+    assert Path(points, 0.0, SPEED, ACCELERATION, np.full(12, SPEED)).durations() == pytest.approx(plain, rel=1e-12)
+
+
 def test_it_rests_at_every_way_point_and_beyond_both_ends():
     points = random_points(np.random.default_rng(2), 5, 0.6)
     path = Path(points, 2.0, SPEED, ACCELERATION)

@@ -773,3 +773,30 @@ def test_the_lift_is_chosen_where_the_arms_alone_do_not_reach(tmp_path):
     up = make(X_BA[:, :3], X_BA[:, 3] + [0, 0, raised[0] - lifted.posture.home[0]])
     high_arc = stances.check_arc(Turn(up, 0.3, posture=raised), grasps)
     assert high_arc.margin == pytest.approx(low_arc.margin, abs=1e-3)  # the valve and the shoulders are as high
+
+
+def test_a_path_keeps_the_speed_of_the_slowest_joint_that_it_moves():
+    """Command_selector would let that joint lag behind, off the way that is known to be free."""
+    slow = ROBOT.arms["right"].speed.copy()
+    slow[0] = 0.2
+    arms = {"left": ROBOT.arms["left"], "right": dc.replace(ROBOT.arms["right"], speed=slow)}
+    law = KinematicApproach(CONFIG, SlowRobot(arms), VALVE, AREA)
+    points = np.array([HOME, HOME + np.eye(12)[6]])
+    planning = Memory(phase="planning", request=PlanRequest(number=3))
+    path = law._follow(0.0, planning, PathPlan(number=3, found=True, points=points.ravel())).path
+    assert path is not None and path.end() == pytest.approx(1 / 0.2 + 0.2 / CONFIG.joint_acceleration)
+
+
+class SlowRobot:
+    """What a path asks of a robot."""
+
+    def __init__(self, arms):
+        self.arms, self.home = arms, HOME
+
+
+def test_an_image_that_comes_after_a_newer_one_is_not_looked_at():
+    law = KinematicApproach(CONFIG, ROBOT, VALVE, AREA)
+    memory = Memory(since=1.0)
+    for sequence, time in ((3, 2.0), (5, 2.25), (4, 2.125), (6, 2.25), (7, 2.375)):
+        memory = law._look(3.0, memory, RectangleEstimate(found=True, sequence=sequence, time=time))
+    assert [look.time for look in memory.looks] == [2.0, 2.25, 2.375]

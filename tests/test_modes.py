@@ -42,6 +42,14 @@ def with_row(mode: Mode, **changes) -> list[Row]:
             with_row(Mode.REACH, retry={Verdict.REACH_LIMIT: Retry("again", 1, Mode.RELEASE)}),
             "the row of reach: after_release goes with a retry by release",
         ),
+        (
+            with_row(Mode.SEARCH, next=None),
+            "the row of search: next must be a mode, which only release, fold, retreat leave to the supervisor",
+        ),
+        (
+            with_row(Mode.REACH, retry={"moves": Retry("moved", 2, Mode.FOLD)}),
+            "the row of reach: retry must be by a cause or a verdict, got 'moves'",
+        ),
     ],
 )
 def test_a_wrong_table_is_refused_in_one_line_that_names_the_row_and_the_rule(rows, words):

@@ -10,6 +10,7 @@ from robot_variants import crooked_wrist, seven_joints, variant, with_roll
 from valve_drake.frames import compose, make, rot_x, rotation, rotation_vector
 from valve_drake.messages import LEFT, RIGHT, SIDES
 from valve_drake.robot import kinematics
+from valve_drake.robot.kinematics import Arm
 from valve_drake.robot.robot import Robot
 from valve_drake.valve.valve import Valve, turned
 
@@ -169,3 +170,12 @@ def test_the_error_between_poses_is_the_motion_that_leads_from_one_to_the_other(
     X = make(rotation(np.array([0.3, 0.2, -0.4])), np.array([1.0, 2, 3]))
     goal = make(rotation(w) @ X[:, :3], X[:, 3] + [0.1, 0, -0.2])
     assert kinematics.pose_error(X, goal) == pytest.approx([*w, 0.1, 0, -0.2], abs=1e-7 * (1 + angle))
+
+
+def test_a_search_begins_all_over_the_range_of_a_joint_whose_limits_are_off_zero():
+    low, high = np.array([3.5, -6.0, 0.8, -np.inf, 2.0, -2.0]), np.array([6.0, -3.5, 5.4, np.inf, np.inf, 2.0])
+    arm = Arm(("a", "b", "c", "d", "e", "f"), low, high, np.ones(6), np.clip(0.0, low, high), np.clip(0.0, low, high))
+    tried = np.array(kinematics.seeds(arm))
+    assert (tried >= low).all() and (tried <= high).all()
+    wide = np.array([2.5, 2.5, 4.6, 2 * np.pi, 2 * np.pi, 4.0])
+    assert (np.ptp(tried, axis=0) > 0.5 * wide).all() and (np.ptp(tried, axis=0) <= wide).all()

@@ -275,3 +275,9 @@ def test_a_waist_that_turns_to_one_side_only_takes_no_part_in_the_sweep(tmp_path
     path = variant(tmp_path, limits("waist", 0.0, 0.5))
     search = next(b for b in make_blocks(load(None, [f"robot={path}"])) if b.get_name() == "valve_search")
     assert search.config.sweep_waist == 0.0
+
+
+def test_the_seventh_joint_of_an_arm_may_be_stuck_in_a_rehearsal(tmp_path):
+    path = variant(tmp_path, seven_joints, lambda given: uneven(given, [1.0] * 7))
+    stuck = "faults=[{kind: stuck, device: left_arm, joint: 6}]"
+    assert load("hardware.scenario.yaml", [f"robot={path}", stuck]).faults[0].joint == 6

@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.geometry import Box
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
 from robot_facts import ROBOT
 
 from valve_drake import scenario as scenarios
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
-from valve_drake.frames import compose, inverse, make, rot_y, rot_z
+from valve_drake.frames import compose, inverse, make, rot_y, rot_z, wrap
 from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
 from valve_drake.valve.model import add_valve, marker_frame
@@ -61,6 +63,7 @@ WRONG = {
     HANDLES % (GOOD + ", {xyz: [0, 0.15, 0], width: 0.2}"): "valve.handles[2].width must be within",
     HANDLES % (GOOD + ", {xyz: [0, 0.15, 0], along: [0, 0, 1]}"): "valve.handles[2].along must be a direction across",
     HANDLES % "{xyz: [0.15, 0, 0]}, {xyz: [0.14, 0.05, 0]}": "valve.handles must be two of them at least 0.12 m apart",
+    HANDLES % "{xyz: [0.15, 0, 0]}, {xyz: [0.15, 0, -0.2]}": "two of them at least 0.12 m apart across the axis",
     HANDLES % "{xyz: [0.15, 0, 0], kind: rim}, {xyz: [-0.2, 0, 0], kind: rim}": "as far from the axis as all others",
     "valve: {handles: 3}": "valve.handles must be a list",
     "valve: {panel: {depth: -1}}": "valve.panel.depth must be within",
@@ -169,3 +172,61 @@ def test_handles_run_outwards_or_round_the_axis_unless_they_say_otherwise():
         assert HandleConfig(kind=kind, xyz=[0.09, 0.12, 0.0]).direction() == pytest.approx(along)
     given = HandleConfig(xyz=[0.09, 0.12, 0.0], along=[0.0, 2.0, 0.0])
     assert given.direction().tolist() == [0, 1, 0]
+
+
+def boxes(text: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """The wheel's boxes of a valve that is made of its keys: name -> pose in A (3, 4), size (3,)."""
+    shape = valve(text)
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    model = add_valve(plant, shape)
+    inspector = scene_graph.model_inspector()
+    out = {}
+    for shape_id in plant.GetCollisionGeometriesForBody(plant.GetBodyByName("wheel", model)):
+        form, X = inspector.GetShape(shape_id), inspector.GetPoseInFrame(shape_id).GetAsMatrix34()
+        if isinstance(form, Box):
+            out[inspector.GetName(shape_id).rpartition("::")[2]] = compose(shape.X_AP(), X), form.size()
+    return out
+
+
+def test_a_bar_goes_straight_out_from_the_axis_whichever_way_its_direction_is_written():
+    one = "valve: {model: '', handles: [{xyz: [0.15, 0, 0], length: 0.3%s}, {xyz: [-0.15, 0, 0]}]}"
+    (X, size), (X_in, size_in) = boxes(one % "")["bar_1"], boxes(one % ", along: [-1, 0, 0]")["bar_1"]
+    assert X[:, 3] == pytest.approx([0.15, 0, 0]) and size == pytest.approx([0.3, 0.025, 0.025])
+    assert X_in[:, 3] == pytest.approx(X[:, 3]) and size_in == pytest.approx(size)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_handle_across_its_arm_is_a_crank_and_runs_where_its_grasp_is(sign):
+    made = boxes(
+        f"valve: {{model: '', handles: [{{xyz: [0.15, 0, 0], along: [0, {sign}, 0]}}, {{xyz: [-0.15, 0, 0]}}]}}"
+    )
+    X, size = made["bar_1"]
+    assert X[:, 3] == pytest.approx([0.15, 0, 0]) and size == pytest.approx([0.06, 0.025, 0.025])
+    assert abs(X[:, 0]) == pytest.approx([0, 1, 0], abs=1e-9)  # its length is along the handle
+    arm, length = made["bar_1_arm"]
+    ends = [arm[:, 3] + side * arm[:, 0] * length[0] / 2 for side in (1, -1)]
+    assert min(np.linalg.norm(end) for end in ends) < 1e-9  # on the axis
+    far = max(ends, key=np.linalg.norm)
+    assert far[0] == pytest.approx(0.15) and abs(far[1]) == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize(("handles", "spokes"), [((0, 180), 4), ((0, 180), 2), ((0, 100), 3), ((10, 200, 290), 1)])
+def test_a_rims_spokes_are_as_far_from_its_handles_as_they_can_be(handles, spokes):
+    degrees = np.radians(handles)
+    places = ", ".join(f"{{kind: rim, xyz: [{0.15 * np.cos(a)}, {0.15 * np.sin(a)}, 0]}}" for a in degrees)
+    made = boxes(f"valve: {{model: '', handles: [{places}], spokes: {spokes}}}")
+    at = [np.arctan2(X[1, 3], X[0, 3]) for name, (X, _) in made.items() if name.startswith("spoke")]
+    room = min(abs(wrap(a - float(b))) for a in at for b in degrees)
+    turns = np.linspace(0, 2 * np.pi / spokes, 721)
+    apart = [wrap(t + 2 * np.pi * k / spokes - float(b)) for t in turns for k in range(spokes) for b in degrees]
+    best = np.abs(apart).reshape(len(turns), -1).min(1).max()
+    assert len(at) == spokes and room > best - 0.03
+
+
+def test_a_wheel_that_is_spread_evenly_keeps_its_spokes_half_way_between():
+    made = boxes(WHEEL)
+    at = sorted(np.arctan2(X[1, 3], X[0, 3]) for name, (X, _) in made.items() if name.startswith("spoke"))
+    assert np.degrees(at) == pytest.approx([-180, -60, 60], abs=0.1) or np.degrees(at) == pytest.approx(
+        [-60, 60, 180], abs=0.1
+    )

@@ -6,6 +6,7 @@ turns with it. A turn that is longer than one grasp reaches is made of several: 
 
 import dataclasses as dc
 import itertools
+import math
 from collections.abc import Iterator, Mapping
 from typing import Protocol
 
@@ -16,6 +17,7 @@ from valve_drake.messages import LEFT, RIGHT
 from valve_drake.valve.valve import Valve, turned
 
 CROSSED = 0.02  # the left hand is to the right of the right one by more than this [m]
+APART = 0.03  # hands that are nearer across the axis leave open how the valve is turned [m]
 PAIRS = 6  # of handles, at most, that are tried of each kind
 
 
@@ -93,7 +95,8 @@ def pairs(valve: Valve, X_BA: np.ndarray, turn_angle: float) -> Iterator[tuple[P
     places = [compose(middle, valve.grasp(k, 1.0)) for k in count]
     at = [float(aside @ X[:2, 3]) for X in places]
     sign = [1.0 if aside @ X[:2, 0] >= 0 else -1.0 for X in places]
-    both = sorted(itertools.permutations(count, 2), key=lambda pair: at[pair[1]] - at[pair[0]])
+    both = [(i, k) for i, k in itertools.permutations(count, 2) if math.dist(valve.radius(i), valve.radius(k)) >= APART]
+    both.sort(key=lambda pair: at[pair[1]] - at[pair[0]])
     plain = [pair for pair in both if at[pair[0]] - at[pair[1]] > -CROSSED][:PAIRS]
     crossed = [pair for pair in both if pair not in plain][:PAIRS]
     for some in (plain, crossed):

@@ -21,21 +21,27 @@ LEAVE = 0.06  # poses this near to the start are not checked: the robot is there
 class Path:
     """Way points of both arms, with a stop at each: trapezoidal speed along every leg.
 
-    points: (N, n) [rad]; start: when it begins [s].
+    points: (N, n) [rad]; start: when it begins [s]. limits: the joints' own speeds (n,) [rad/s]; None: none is slower
+    than `speed`.
     """
 
     points: np.ndarray
     start: float
     speed: float  # of the fastest joint [rad/s]
     acceleration: float  # [rad/s^2]
+    limits: np.ndarray | None = None
 
     def durations(self) -> np.ndarray:
         """Time of each leg [s] -> (N-1,)."""
-        reach = np.max(np.abs(np.diff(self.points, axis=0)), axis=1)
-        short = reach < self.speed**2 / self.acceleration
-        return np.where(
-            short, 2 * np.sqrt(reach / self.acceleration), reach / self.speed + self.speed / self.acceleration
-        )
+        ways = np.abs(np.diff(self.points, axis=0))
+        reach = np.max(ways, axis=1)
+        speed: float | np.ndarray = self.speed
+        if self.limits is not None:  # of the joint that goes farthest, so that each keeps its own
+            slowest = np.max(ways / self.limits, axis=1)  # [s]
+            speed = np.minimum(speed, reach / np.maximum(slowest, 1e-12))
+            speed = np.where(reach > 0, speed, self.speed)
+        short = reach < speed**2 / self.acceleration
+        return np.where(short, 2 * np.sqrt(reach / self.acceleration), reach / speed + speed / self.acceleration)
 
     def end(self) -> float:
         return self.start + float(np.sum(self.durations()))

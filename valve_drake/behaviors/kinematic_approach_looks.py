@@ -34,6 +34,7 @@ class Looks(Motion):
             self.valve.seen_by(estimate)
             and estimate.sequence != m.seen
             and estimate.time >= m.since + self.config.settle
+            and (not m.looks or estimate.time > m.looks[-1].time)  # an image may come late, after a newer one
         ):
             m = changed(m, looks=(*m.looks, estimate), seen=estimate.sequence)
         return m

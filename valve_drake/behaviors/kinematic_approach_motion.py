@@ -12,6 +12,7 @@ from valve_drake.config import Config, number
 from valve_drake.frames import apply, compose, inverse, make, planar
 from valve_drake.memory import changed
 from valve_drake.messages import (
+    SIDES,
     Cause,
     GraspPlan,
     HandleMarks,
@@ -107,6 +108,8 @@ class Motion:
         self.robot = robot
         self.reference_area = reference_area
         self.home = self.robot.home
+        speeds = np.concatenate([robot.arms[side].speed for side in SIDES])
+        self._limits = speeds if (speeds < config.joint_speed).any() else None
 
     def _status(
         self, m: Memory, time: float, state: str, verdict: str = "", detail: str = "", cause: str = Cause.NONE
@@ -167,5 +170,5 @@ class Motion:
         if not answer.found:
             return changed(m, phase="blocked", since=time)
         points = answer.points.reshape(-1, len(self.home))
-        path = Path(points, time, self.config.joint_speed, self.config.joint_acceleration)
+        path = Path(points, time, self.config.joint_speed, self.config.joint_acceleration, self._limits)
         return changed(m, phase="moving", path=path, since=time)

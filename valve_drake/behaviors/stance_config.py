@@ -37,11 +37,15 @@ class StanceConfig(Config):
             require(value == 0 or value >= 0.3, f"{key}.{name}", "0 (the robot's) or at least 0.3", value)
 
     def distances(self, stand: tuple[float, float]) -> np.ndarray:
-        """What is tried, from near to far (K,) [m]. stand: the robot's. Raises ConfigError: none, or too many."""
+        """What is tried, from near to far (K,) [m]. stand: the robot's. Raises ConfigError: none, or too many.
+
+        A robot whose arms reach far has too many by the default step: then it is a wider one.
+        """
         low, high = self.distance_min or stand[0], self.distance_max or stand[1]
         require(low <= high, f"{self.KEY}.distance_min", f"at most the largest distance, {high:g}", low)
-        most = MAX_PLACES - 1
-        few = high - low <= most * self.distance_step
-        words = f"at least {(high - low) / most:.3g}: {MAX_PLACES} distances"
-        require(few, f"{self.KEY}.distance_step", words, self.distance_step)
-        return np.arange(low, high + 1e-9, self.distance_step)
+        least, step = (high - low) / (MAX_PLACES - 1), self.distance_step
+        few = high - low <= (MAX_PLACES - 1) * step
+        if not few and step == StanceConfig.distance_step:
+            return np.linspace(low, high, MAX_PLACES)
+        require(few, f"{self.KEY}.distance_step", f"at least {least:.3g}: {MAX_PLACES} distances", step)
+        return np.arange(low, high + 1e-9, step)

@@ -29,6 +29,7 @@ _LAST = 1e-3  # after so small a step the next error is below TOLERANCE [rad]
 _ITERATIONS = 40
 _PATIENCE = 8  # iterations in which the error must have halved
 _SEEDS = 10  # random ones, beside the working posture and home
+_MOSTLY = 0.6  # share of a joint's range; with less of it within half a turn of zero, it is searched all over
 _ENOUGH = 0.5  # margin at which no further seed is tried
 _ROOM = math.radians(40)  # to a joint limit that is comfortable
 _SINGULAR, _REGULAR = 0.05, 0.20  # least singular value of the scaled Jacobian at margins 0 and 1
@@ -176,6 +177,8 @@ def seeds(arm: Arm) -> list[np.ndarray]:
     """Where a search without a neighbour begins: always the same places."""
     rng = np.random.Generator(np.random.SFC64(len(arm)))
     low, high = np.maximum(arm.low, -math.pi), np.minimum(arm.high, math.pi)
+    beyond = high - low < _MOSTLY * np.minimum(arm.high - arm.low, 2 * math.pi)  # of such a joint zero is no middle
+    low, high = np.where(beyond, arm.low, low), np.where(beyond, np.minimum(arm.high, arm.low + 2 * math.pi), high)
     return [arm.work, arm.home, *(low + (high - low) * rng.uniform(0.1, 0.9, len(arm)) for _ in range(_SEEDS))]
 
 

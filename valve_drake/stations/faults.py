@@ -29,6 +29,7 @@ from valve_drake.checks import require
 from valve_drake.config import Config, choice, number
 from valve_drake.messages import Mode
 from valve_drake.ports import TICK
+from valve_drake.robot.description import MOST_JOINTS
 from valve_drake.robot.groups import GROUPS
 from valve_drake.stations.lcm_channels import CHANNELS, DEVICES
 
@@ -49,7 +50,7 @@ class FaultConfig(Config):
     share: float = number(0.0, 0.0, 1.0, "of messages")
     delay: float = number(0.0, 0.0, 5.0, "of messages [s]")
     jitter: float = number(0.0, 0.0, 5.0, "half the width of an even spread of the delay [s]")
-    joint: int = number(0, 0, 5, "that is stuck")
+    joint: int = number(0, 0, MOST_JOINTS + 2, "that is stuck")
 
     def relations(self, key: str) -> None:
         require(self.jitter <= self.delay, f"{key}.jitter", f"at most the delay, {self.delay:g}", self.jitter)

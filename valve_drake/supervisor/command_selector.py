@@ -196,7 +196,7 @@ def step(
             k = GRIPPERS.index(group)
             wanted[group] = np.array([config.gripper_high, m.force[k]])
             continue
-        value, problem = _asked(config, time, group, commands.get(block), len(m.twist))
+        value, problem = _asked(config, time, group, commands.get(block), _size(m, group))
         if problem:
             refused.append(f"{group}: {problem}")
         if value is None:
@@ -268,7 +268,7 @@ def _asked(
 ) -> tuple[np.ndarray | None, str]:
     """What a block asks of a group, or None with the reason if it cannot be used ("" if it does not ask).
 
-    count: of the base's speeds.
+    count: of the group's values.
     """
     if command is None:
         return None, "no command"
@@ -277,13 +277,21 @@ def _asked(
     value = getattr(command, "base_twist" if group == "base" else group)
     if value is None:
         return None, ""
-    if group == "base" and len(value) != count:
-        return None, f"a twist of {len(value)} speeds"
+    if len(value) != count:
+        return None, f"a twist of {len(value)} speeds" if group == "base" else f"{len(value)} values, not {count}"
     if not all(map(math.isfinite, value.tolist())):  # of so few numbers a fifth of numpy's time
         return None, "not finite"
     if group in GRIPPERS and value[1] < 0:
         return None, f"force limit {value[1]:.1f} N"
     return value, ""
+
+
+def _size(m: Memory, group: str) -> int:
+    """How many values a command of this group has."""
+    if group in GRIPPERS:
+        return 2  # opening and force limit
+    part = m.bounds.parts.get(group)
+    return len(m.twist) if part is None else part.stop - part.start
 
 
 def _base(m: Memory, wanted: np.ndarray | None, dt: float) -> tuple[np.ndarray, list[str]]:

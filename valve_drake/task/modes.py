@@ -22,6 +22,7 @@ HOLD = "hold"  # instead of a block: nobody commands this group, it stands still
 OPEN = "command_selector"  # instead of a block: the selector itself opens the hands
 BEHAVIORS = ("valve_search", "base_approach", "kinematic_approach", "image_servo", "hybrid_rotation")
 
+DECIDED = (Mode.RELEASE, Mode.FOLD, Mode.RETREAT)  # what follows them depends on the run
 ANY = Cause.NONE  # in Row.retry: whatever the behaviour gives as its reason
 
 
@@ -269,6 +270,12 @@ def checked(rows: Iterable[Row]) -> dict[Mode, Row]:
         bounded = 0 < row.deadline < math.inf
         if bool(row.owner) != bounded:
             raise ConfigError(f"{where}: a mode with an owner has a deadline, and no other; got {row.deadline}")
+        if row.owner and row.next is None and row.mode not in DECIDED:
+            decided = ", ".join(mode.value for mode in DECIDED)
+            raise ConfigError(f"{where}: next must be a mode, which only {decided} leave to the supervisor")
+        unknown = [key for key in row.retry if key not in (*Cause, *Verdict)]
+        if unknown:
+            raise ConfigError(f"{where}: retry must be by a cause or a verdict, got {unknown[0]!r}")
         if row.final and (row.owner or row.next or row.retry):
             raise ConfigError(f"{where}: a final mode has no owner and leads nowhere")
         if row.contact and row.off != Mode.RELEASE:

@@ -35,8 +35,10 @@ STICKER = 1e-5  # thickness of the marker: a plate would show its rim to a camer
 MARK = (0.040, 0.022, 0.001)  # a green mark: along its handle, across it, thick [m]
 FRICTION, STIFFNESS, DISSIPATION = 0.8, 5e4, 5.0  # of a handle under a pad [-, N/m, s/m]
 TORQUE = 5.1  # effort limit of the stem's friction until a scene sets it [N m]
+CLEARLY = 0.02  # spokes that are so much farther from the handles are worth another place [rad]
 SEGMENTS = 40  # of a rim
 ON_MODEL = 0.001  # by which a model's frame may differ from the keys [m, rad]
+STRAIGHT = 0.02  # sine of the angle to the radius below which a bar goes straight out from the axis
 HUB = 0.03  # radius of a made valve's hub and stem [m]
 
 
@@ -144,9 +146,15 @@ def _made(plant: MultibodyPlant, valve: Valve) -> ModelInstanceIndex:
         d, xyz, w = handle.direction(), np.array(handle.xyz), handle.width
         if handle.kind == "rim":
             continue
-        end = xyz + d * handle.length / 2
+        name, half = f"{handle.kind}_{k + 1}", handle.length / 2
         start = np.array([0.0, 0.0, handle.xyz[2]])
-        _beam(plant, wheel, X_PA, start, end, w, f"{handle.kind}_{k + 1}", STEEL, solid=True)
+        out = xyz - start
+        if abs(out[0] * d[1] - out[1] * d[0]) < STRAIGHT * math.hypot(out[0], out[1]):  # it goes on as it comes
+            _beam(plant, wheel, X_PA, start, xyz + math.copysign(1.0, out @ d) * d * half, w, name, STEEL, solid=True)
+            continue
+        foot = xyz - math.copysign(half, out @ d) * d  # a crank: what is held begins where its arm ends
+        _beam(plant, wheel, X_PA, start, foot, w, f"{name}_arm", STEEL, solid=True)
+        _beam(plant, wheel, X_PA, foot, 2 * xyz - foot, w, name, STEEL, solid=True)
     _rim(plant, wheel, X_PA, valve)
     for k, handle in enumerate(valve.handles):
         d = handle.direction()
@@ -175,11 +183,23 @@ def _rim(plant: MultibodyPlant, wheel: RigidBody, X_PA: np.ndarray, valve: Valve
         R = rot_z(first[0] + k * step)
         X = compose(X_PA, make(R, R @ np.array([radius, 0, 0]) + [0, 0, z]))
         _solid(plant, wheel, _rigid(X), Box(width, length, width), f"rim_{k + 1}", STEEL, holds=True)
-    between = first[0] + even / 2 if spread else first[0]
+    between = _between(first, first[0] + even / 2 if spread else first[0], valve.spokes)
     for k in range(valve.spokes):
         direction = rot_z(between + 2 * math.pi * k / valve.spokes)[:, 0]
         end = direction * radius + [0, 0, z]
         _beam(plant, wheel, X_PA, np.array([0.0, 0.0, z]), end, 0.016, f"spoke_{k + 1}", DARK, solid=True)
+
+
+def _between(handles: list[float], usual: float, spokes: int) -> float:
+    """The angle of a spoke such that none is near a handle: the usual one, unless another is clearly farther [rad]."""
+    if spokes == 0:
+        return usual
+    step = 2 * math.pi / spokes
+    places = sorted(handle % step for handle in handles)
+    gaps = [after - at for at, after in zip(places, [*places[1:], places[0] + step])]
+    widest = max(range(len(gaps)), key=lambda k: gaps[k])
+    room = min(abs((usual - place + step / 2) % step - step / 2) for place in places)
+    return usual if room > gaps[widest] / 2 - CLEARLY else places[widest] + gaps[widest] / 2
 
 
 def _beam(

@@ -129,8 +129,9 @@ class Valve(Config):
         handles = self.handles
         require(2 <= len(handles) <= 12, f"{key}.handles", "2 to 12 places, one for each hand", len(handles))
         require(len(self.obstacles) <= 20, f"{key}.obstacles", "at most 20 boxes", len(self.obstacles))
-        apart = max(math.dist(a.xyz, b.xyz) for a in handles for b in handles)
-        require(apart >= 0.12, f"{key}.handles", "two of them at least 0.12 m apart, for two hands", f"{apart:.3g} m")
+        apart = max(math.dist(a.xyz[:2], b.xyz[:2]) for a in handles for b in handles)
+        words = "two of them at least 0.12 m apart across the axis, for two hands"
+        require(apart >= 0.12, f"{key}.handles", words, f"{apart:.3g} m")
         for k, handle in enumerate(handles):
             before = handle.xyz[2] < self.panel.depth
             require(before, f"{key}.handles[{k}].xyz", f"before the panel, z below {self.panel.depth:g}", handle.xyz)
