@@ -63,6 +63,18 @@ def test_a_hand_lets_go_when_the_valve_has_turned_so_far_and_obeys_again():
     assert does(1.2) == [0.0, 70.0]
 
 
+def test_a_hand_lets_go_of_a_valve_that_is_being_closed_where_it_comes_to_the_place_and_not_before():
+    system = LostGripSystem(MishapConfig(grip_lost_at=0.5, grip_lost_for=0.25), 0.1, ROBOT)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    for name, value in (("angle", 1.7), ("position", 0.0), ("force", 70.0)):
+        system.GetInputPort(name).FixValue(context, [value])
+    for until, angle, force in ((0.5, 0.7, 70.0), (0.6, 0.59, 70.0), (0.7, 0.59, OPENING_FORCE), (1.2, 0.1, 70.0)):
+        simulator.AdvanceTo(until)
+        assert system.GetOutputPort("force_limit").Eval(context)[0] == force
+        system.GetInputPort("angle").FixValue(context, [angle])
+
+
 def test_the_station_puts_a_lost_grip_between_the_command_and_the_hand():
     rig = Rig(["simulation.mishap.grip_lost_at=0.0", "simulation.mishap.grip_lost_for=0.5"])
     rig.set("left_gripper.position_command", np.array([0.03]))

@@ -13,6 +13,7 @@ from valve_drake.robot.robot import Robot
 from valve_drake.stations.simulation_config import MishapConfig
 from valve_drake.task.modes import TERMINAL
 
+THERE = 1e-3  # a valve that begins so near to where a hand lets go is there [rad]
 OPENING_FORCE = 40.0  # of the finger actuator of a hand that lets go [N]
 
 
@@ -35,6 +36,7 @@ class LostGripSystem(PythonSystem):
         ports = (self.DeclareVectorInputPort(name, 1) for name in ("angle", "position", "force"))
         self._angle, self._position, self._force = ports
         self._since = self.DeclareDiscreteState([math.inf])  # when it let go [s]
+        self._from = self.DeclareDiscreteState([math.nan])  # on which side of the place the valve began: -1, 0, 1
         self.DeclarePeriodicDiscreteUpdateEvent(TICK, 0.0, self._watch)
         self.DeclareVectorOutputPort("position_command", 1, self._calc_position)
         self.DeclareVectorOutputPort("force_limit", 1, self._calc_force)
@@ -46,9 +48,12 @@ class LostGripSystem(PythonSystem):
         output.SetFromVector([OPENING_FORCE] if self._lost(context) else self._force.Eval(context))
 
     def _watch(self, context: Context, values: DiscreteValues) -> None:
-        since = context.get_discrete_state(self._since)[0]
-        turned = abs(self._angle.Eval(context)[0] - self._closed)
-        if since == math.inf and turned >= self._mishap.grip_lost_at:
+        since, side = (float(context.get_discrete_state(k)[0]) for k in (self._since, self._from))
+        beyond = abs(self._angle.Eval(context)[0] - self._closed) - self._mishap.grip_lost_at
+        if math.isnan(side):
+            side = math.copysign(1.0, beyond) if abs(beyond) > THERE else 0.0
+            values.set_value(self._from, [side])
+        if since == math.inf and side * beyond <= 0:  # it comes to the place, from whichever side
             values.set_value(self._since, [context.get_time()])
 
     def _lost(self, context: Context) -> bool:
