@@ -8,6 +8,8 @@ from pydrake.systems.framework import DiagramBuilder
 from robot_facts import ROBOT
 
 from valve_drake import scenario as scenarios
+from valve_drake.behaviors.stance_config import StanceConfig
+from valve_drake.behaviors.stance_search import Stances
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, inverse, make, rot_y, rot_z, wrap
@@ -202,13 +204,29 @@ def test_a_handle_across_its_arm_is_a_crank_and_runs_where_its_grasp_is(sign):
         f"valve: {{model: '', handles: [{{xyz: [0.15, 0, 0], along: [0, {sign}, 0]}}, {{xyz: [-0.15, 0, 0]}}]}}"
     )
     X, size = made["bar_1"]
-    assert X[:, 3] == pytest.approx([0.15, 0, 0]) and size == pytest.approx([0.06, 0.025, 0.025])
     assert abs(X[:, 0]) == pytest.approx([0, 1, 0], abs=1e-9)  # its length is along the handle
+    ends = sorted(X[1, 3] + side * size[0] / 2 for side in (1, -1))
+    assert X[[0, 2], 3] == pytest.approx([0.15, 0]) and size[1:] == pytest.approx([0.025, 0.025])
+    free = [-0.03, 0.03]  # for a hand; beside it is the foot
+    foot = 0 if abs(ends[0]) > abs(ends[1]) else 1
+    assert ends[1 - foot] == pytest.approx(free[1 - foot]) and abs(ends[foot] - free[foot]) == pytest.approx(0.025)
+    riser, tall = made["bar_1_riser"]
+    assert riser[:, 3] == pytest.approx([0.15, np.sign(free[foot]) * 0.0425, 0.025]) and tall[2] == pytest.approx(0.075)
     arm, length = made["bar_1_arm"]
-    ends = [arm[:, 3] + side * arm[:, 0] * length[0] / 2 for side in (1, -1)]
-    assert min(np.linalg.norm(end) for end in ends) < 1e-9  # on the axis
-    far = max(ends, key=np.linalg.norm)
-    assert far[0] == pytest.approx(0.15) and abs(far[1]) == pytest.approx(0.03)
+    both = [arm[:, 3] + side * arm[:, 0] * length[0] / 2 for side in (1, -1)]
+    near, far = sorted(both, key=lambda end: float(np.hypot(*end[:2])))
+    assert near == pytest.approx([0, 0, 0.05], abs=1e-9) and far[:2] == pytest.approx(riser[:2, 3])
+
+
+def test_both_hands_hold_the_cranks_of_a_valve_that_is_made_of_its_keys():
+    crank = "{xyz: [%s, 0, 0], along: [0, 1, 0]}"
+    handles = f"[{crank % 0.15}, {crank % -0.15}]"
+    shape = valve(f"valve: {{model: '', marker: {{size: [0.08, 0.08], face: 0.1}}, handles: {handles}}}")
+    robot = Robot.load(OURS, shape)
+    X_OA = compose(make(FACING, np.array([1.5, 0, 1.0])), inverse(shape.X_AP()))
+    along = dict.fromkeys(("left", "right"), np.array([0.0, 0.0, 1.0]))
+    stances = Stances(robot, shape, StanceConfig(), along, CollisionModel(robot).is_free)
+    assert stances.find(X_OA, np.pi / 2)[1] > 0.5
 
 
 @pytest.mark.parametrize(("handles", "spokes"), [((0, 180), 4), ((0, 180), 2), ((0, 100), 3), ((10, 200, 290), 1)])

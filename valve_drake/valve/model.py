@@ -38,6 +38,7 @@ TORQUE = 5.1  # effort limit of the stem's friction until a scene sets it [N m]
 CLEARLY = 0.02  # spokes that are so much farther from the handles are worth another place [rad]
 SEGMENTS = 40  # of a rim
 ON_MODEL = 0.001  # by which a model's frame may differ from the keys [m, rad]
+BEHIND = 0.05  # of a crank's arm behind its handle, where fingers have room [m]
 STRAIGHT = 0.02  # sine of the angle to the radius below which a bar goes straight out from the axis
 HUB = 0.03  # radius of a made valve's hub and stem [m]
 
@@ -152,9 +153,15 @@ def _made(plant: MultibodyPlant, valve: Valve) -> ModelInstanceIndex:
         if abs(out[0] * d[1] - out[1] * d[0]) < STRAIGHT * math.hypot(out[0], out[1]):  # it goes on as it comes
             _beam(plant, wheel, X_PA, start, xyz + math.copysign(1.0, out @ d) * d * half, w, name, STEEL, solid=True)
             continue
-        foot = xyz - math.copysign(half, out @ d) * d  # a crank: what is held begins where its arm ends
-        _beam(plant, wheel, X_PA, start, foot, w, f"{name}_arm", STEEL, solid=True)
-        _beam(plant, wheel, X_PA, foot, 2 * xyz - foot, w, name, STEEL, solid=True)
+        # A crank: its arm comes from behind, beside the length that is free for a hand.
+        inwards = -math.copysign(1.0, out @ d) * d
+        foot, rise = xyz + inwards * (half + w / 2), max(min(BEHIND, p.depth - w - handle.xyz[2]), 0.0)
+        behind = np.array([0.0, 0.0, rise])
+        _beam(plant, wheel, X_PA, start + behind, foot + behind, w, f"{name}_arm", STEEL, solid=True)
+        if rise > 0:
+            X_riser = compose(X_PA, make(rot_z(math.atan2(d[1], d[0])), foot + behind / 2))
+            _solid(plant, wheel, _rigid(X_riser), Box(w, w, rise + w), f"{name}_riser", STEEL, holds=True)
+        _beam(plant, wheel, X_PA, foot + inwards * w / 2, xyz - inwards * half, w, name, STEEL, solid=True)
     _rim(plant, wheel, X_PA, valve)
     for k, handle in enumerate(valve.handles):
         d = handle.direction()
