@@ -13,6 +13,7 @@ import subprocess
 import sys
 import textwrap
 import time
+import types
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -706,6 +707,20 @@ def test_the_sequential_test_tells_a_great_difference_early_and_none_never():
     few = statistics.sequential(bad[:6], good[:6])
     assert few.verdict == "cannot tell yet" and 0 < few.more < 60
     assert statistics.sequential([], []).verdict == "cannot tell yet"
+
+
+@pytest.mark.parametrize(
+    "error, words", [(TypeError("no ssl_context\nat all"), "no ssl_context"), (TimeoutError(), "TimeoutError")]
+)
+def test_whatever_dask_raises_is_one_line(tmp_path, monkeypatch, capsys, error, words):
+    def client(*args, **options):
+        raise error
+
+    monkeypatch.setitem(sys.modules, "distributed", types.SimpleNamespace(Client=client))
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["campaign", "--runs", "1", "--backend", "dask", "--scheduler", "tls://x:1"]) == 1
+    assert capsys.readouterr().err == f"valve-drake: Dask does not answer at 'tls://x:1': {words}\n"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_dask_gives_the_same_records(tmp_path, fake, monkeypatch):

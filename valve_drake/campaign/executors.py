@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import Iterator
 
 from valve_drake.campaign.trial import break_off
-from valve_drake.checks import ConfigError, OperationFailed, require
+from valve_drake.checks import ConfigError, OperationFailed, require, shown
 
 
 @contextlib.contextmanager
@@ -30,14 +30,17 @@ def executor(backend: str, jobs: int, scheduler: str | None = None) -> Iterator[
         import distributed
     except ImportError:
         raise ConfigError("--backend dask needs distributed: pip install 'valve-drake[dask]'") from None
+    cluster = None
     try:
-        cluster = None
         if scheduler is None:
             cluster = distributed.LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
-        client = distributed.Client(cluster or scheduler, timeout=20)
-    except (OSError, TimeoutError, ValueError) as error:
-        where = scheduler or "a cluster on this machine"
-        raise OperationFailed(f"Dask does not answer at {where}: {str(error).splitlines()[0]}") from None
+        client = distributed.Client(scheduler if cluster is None else cluster, timeout=20)
+    except Exception as error:  # of its many parts; some say nothing
+        if cluster is not None:
+            cluster.close()
+        where = "a cluster on this machine" if scheduler is None else shown(scheduler)
+        words = str(error).splitlines() or [type(error).__name__]
+        raise OperationFailed(f"Dask does not answer at {where}: {words[0]}") from None
     try:
         yield client.get_executor(pure=False, retries=0)
     finally:
