@@ -1,5 +1,6 @@
 """Files that commands write: nothing is destroyed, nothing is half written, a refusal is one line."""
 
+import math
 import os
 import resource
 import signal
@@ -176,3 +177,24 @@ def test_the_files_in_a_folder_are_checked_like_any_other(tmp_path):
     os.mkfifo(tmp_path / "b")
     with pytest.raises(ConfigError, match="regular file"):
         outputs.check_folder(tmp_path, "--out", ["a", "b"], made_before=lambda path: True)
+
+
+def test_whether_a_file_holds_a_text_is_asked_of_anything(tmp_path):
+    page = tmp_path / "page"
+    assert not outputs.holds(tmp_path / "none", "Made by us") and not outputs.holds(tmp_path, "Made by us")
+    page.write_bytes(bytes(1 << 20))
+    assert not outputs.holds(page, "Made by us")
+    with open(page, "ab") as file:
+        file.write(b"\xff Made by us")
+    assert outputs.holds(page, "Made by us")
+    page.write_bytes(b"")
+    assert not outputs.holds(page, "Made by us")
+
+
+def test_json_that_is_written_has_no_numbers_that_json_does_not_know():
+    tree = {"a": [math.nan, (1.5, -math.inf)], "b": {"c": math.inf, "d": "x", "e": True}}
+    assert outputs.json_text(tree) == '{"a": [null, [1.5, null]], "b": {"c": null, "d": "x", "e": true}}'
+    assert outputs.parse_json(b'[NaN, -Infinity, {"a": 1}]') == [None, None, {"a": 1}]
+    for text in (b"", b"{", b"[" * 100_000, b"\xff", b"9" * 5000):
+        with pytest.raises(ValueError):
+            outputs.parse_json(text)

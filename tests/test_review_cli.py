@@ -159,6 +159,15 @@ def test_export_goes_beside_the_log_by_default_and_names_joints(log, capsys, tmp
     assert float(rows[0][head.index("joints[waist].position")]) == 0.1
 
 
+def test_a_damaged_table_is_a_file_like_any_other_and_not_replaced(log, capsys, tmp_path):
+    path = tmp_path / "t.npz"
+    assert review(capsys, log, "--export", "npz", "--topic", "/hybrid_rotation/turn", "--out", path)[0] == 0
+    damaged = path.read_bytes().replace(b"PK\x01\x02", b"PKxx")
+    path.write_bytes(damaged)
+    code, _, error = review(capsys, log, "--export", "npz", "--topic", "/hybrid_rotation/turn", "--out", path)
+    assert code == 2 and "--out must be a file that does not exist yet" in error and path.read_bytes() == damaged
+
+
 def test_export_npz_gives_arrays_by_field(log, capsys, tmp_path):
     path = tmp_path / "t.npz"
     assert review(capsys, log, "--export", "npz", "--topic", "/hybrid_rotation/turn", "--out", path)[0] == 0

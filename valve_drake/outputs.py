@@ -8,6 +8,7 @@ moves is claimed by recording/container.py, which keeps to the same rules.
 import contextlib
 import json
 import math
+import mmap
 import os
 import secrets
 import stat
@@ -69,6 +70,15 @@ def check_folder(
     for name in names:
         check(folder / name, option, inputs, made_before, new_folders=True)
     return folder
+
+
+def holds(path: Path, text: str) -> bool:
+    """Whether a file holds this text, for `made_before`; the file may be of any size and kind."""
+    try:
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            return data.find(text.encode()) >= 0
+    except (OSError, ValueError):  # cannot be read, or is empty
+        return False
 
 
 def json_text(tree: Any, indent: int | None = None) -> str:

@@ -32,11 +32,14 @@ def write(log: LogReader, topic: str, form: str, path: Path) -> int:
 
 def was_made(path: Path) -> bool:
     """Whether a file is a table that `write` made."""
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            return archive.namelist()[:2] == ["time_ns.npy", "time.npy"]
-    with open(path, "rb") as file:
-        return file.read(12) == b"time_ns,time"
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                return archive.namelist()[:2] == ["time_ns.npy", "time.npy"]
+        with open(path, "rb") as file:
+            return file.read(12) == b"time_ns,time"
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
+        return False
 
 
 def to_npz(arrays: dict[str, np.ndarray]) -> bytes:

@@ -16,7 +16,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from valve_drake import yaml_file
+from valve_drake import outputs, yaml_file
 from valve_drake.analysis import two_logs
 from valve_drake.analysis.comparison import Divergence
 from valve_drake.analysis.conversation import exchanges
@@ -217,7 +217,7 @@ def plain(value: Any) -> Any:
 
 def was_made(path: Path) -> bool:
     """Whether a file is a page that `review` made."""
-    return MADE.encode() in path.read_bytes()
+    return outputs.holds(path, MADE)
 
 
 # ---------------------------------------------------------------- the page

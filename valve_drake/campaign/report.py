@@ -60,10 +60,7 @@ def _degrees(record: Record, a: str, b: str) -> float | None:
 
 def was_made(path: Path) -> bool:
     """Whether a file is such a page."""
-    try:
-        return MADE in path.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return False
+    return outputs.holds(path, MADE)
 
 
 def table(records: list[Record]) -> str:
