@@ -56,6 +56,7 @@ WRONG = {
         "valve.marker.carrier must be wheel: a panel's marker beside these handles, 0.301 m off the axis, is not seen"
     ),
     "valve: {marker: {carrier: door}}": "valve.marker.carrier must be wheel or panel",
+    "valve: {model: '', marker: {mark_height: 0.001}}": "valve.marker.mark_height must be at least 0.003 on handles",
     "valve: {opens: left}": "valve.opens must be counter_clockwise or clockwise",
     HANDLES % "{xyz: [0.15, 0, 0]}": "valve.handles must be 2 to 12 places",
     HANDLES % (GOOD + ", {xyz: [0.15, 0]}"): "valve.handles[2].xyz must be 3 values",
@@ -248,3 +249,14 @@ def test_a_wheel_that_is_spread_evenly_keeps_its_spokes_half_way_between():
     assert np.degrees(at) == pytest.approx([-180, -60, 60], abs=0.1) or np.degrees(at) == pytest.approx(
         [-60, 60, 180], abs=0.1
     )
+
+
+@pytest.mark.parametrize("kind", ["bar", "rim", "crank"])
+@pytest.mark.parametrize(("width", "high", "thick"), [(0.025, 0.013, 0.025), (0.06, 0.013, 0.025), (0.06, 0.04, 0.06)])
+def test_green_marks_lie_on_wide_handles_and_not_within(kind, width, high, thick):
+    along = ", along: [0, 1, 0]" if kind == "crank" else ""
+    one = f"kind: {'bar' if kind == 'crank' else kind}, width: {width}{along}"
+    places = f"{{xyz: [0.15, 0, 0], {one}}}, {{xyz: [-0.15, 0, 0], {one}}}"
+    made = boxes(f"valve: {{model: '', marker: {{mark_height: {high}}}, handles: [{places}]}}")
+    size = made["rim_1" if kind == "rim" else "bar_1"][1]
+    assert width in size.tolist() and size[2] == pytest.approx(thick) and size[2] / 2 <= high - 0.0005 + 1e-9

@@ -151,7 +151,8 @@ def _made(plant: MultibodyPlant, valve: Valve) -> ModelInstanceIndex:
         start = np.array([0.0, 0.0, handle.xyz[2]])
         out = xyz - start
         if abs(out[0] * d[1] - out[1] * d[0]) < STRAIGHT * math.hypot(out[0], out[1]):  # it goes on as it comes
-            _beam(plant, wheel, X_PA, start, xyz + math.copysign(1.0, out @ d) * d * half, w, name, STEEL, solid=True)
+            end = xyz + math.copysign(1.0, out @ d) * d * half
+            _beam(plant, wheel, X_PA, start, end, w, name, STEEL, solid=True, thick=_thick(w, m.mark_height))
             continue
         # A crank: its arm comes from behind, beside the length that is free for a hand.
         inwards = -math.copysign(1.0, out @ d) * d
@@ -161,7 +162,8 @@ def _made(plant: MultibodyPlant, valve: Valve) -> ModelInstanceIndex:
         if rise > 0:
             X_riser = compose(X_PA, make(rot_z(math.atan2(d[1], d[0])), foot + behind / 2))
             _solid(plant, wheel, _rigid(X_riser), Box(w, w, rise + w), f"{name}_riser", STEEL, holds=True)
-        _beam(plant, wheel, X_PA, foot + inwards * w / 2, xyz - inwards * half, w, name, STEEL, solid=True)
+        ends = foot + inwards * w / 2, xyz - inwards * half
+        _beam(plant, wheel, X_PA, *ends, w, name, STEEL, solid=True, thick=_thick(w, m.mark_height))
     _rim(plant, wheel, X_PA, valve)
     for k, handle in enumerate(valve.handles):
         d = handle.direction()
@@ -177,6 +179,7 @@ def _rim(plant: MultibodyPlant, wheel: RigidBody, X_PA: np.ndarray, valve: Valve
     if not rims:
         return
     z, width = rims[0].xyz[2], rims[0].width
+    thick = _thick(width, valve.marker.mark_height)
     radius = math.hypot(*rims[0].xyz[:2])
     first = sorted(math.atan2(h.xyz[1], h.xyz[0]) for h in rims)
     count = SEGMENTS
@@ -189,12 +192,18 @@ def _rim(plant: MultibodyPlant, wheel: RigidBody, X_PA: np.ndarray, valve: Valve
     for k in range(count):
         R = rot_z(first[0] + k * step)
         X = compose(X_PA, make(R, R @ np.array([radius, 0, 0]) + [0, 0, z]))
-        _solid(plant, wheel, _rigid(X), Box(width, length, width), f"rim_{k + 1}", STEEL, holds=True)
+        _solid(plant, wheel, _rigid(X), Box(width, length, thick), f"rim_{k + 1}", STEEL, holds=True)
     between = _between(first, first[0] + even / 2 if spread else first[0], valve.spokes)
     for k in range(valve.spokes):
         direction = rot_z(between + 2 * math.pi * k / valve.spokes)[:, 0]
         end = direction * radius + [0, 0, z]
         _beam(plant, wheel, X_PA, np.array([0.0, 0.0, z]), end, 0.016, f"spoke_{k + 1}", DARK, solid=True)
+
+
+def _thick(width: float, mark_height: float) -> float:
+    """Of a handle, along z of A [m]: a wide one is flat, or its green mark would be within it."""
+    below = mark_height - MARK[2] / 2
+    return width if width / 2 <= below + 1e-9 else 2 * below
 
 
 def _between(handles: list[float], usual: float, spokes: int) -> float:
@@ -220,13 +229,14 @@ def _beam(
     color: tuple[float, ...],
     *,
     solid: bool,
+    thick: float | None = None,
 ) -> None:
-    """A square bar between two points of A, level with z of A."""
+    """A bar between two points of A, level with z of A; thick: along z; None: a square one."""
     way = end - start
     length = float(np.linalg.norm(way))
     R = rot_z(math.atan2(way[1], way[0]))
     X = compose(X_PA, make(R, (start + end) / 2))
-    _solid(plant, body, _rigid(X), Box(length, width, width), name, color, holds=solid)
+    _solid(plant, body, _rigid(X), Box(length, width, width if thick is None else thick), name, color, holds=solid)
 
 
 def _solid(

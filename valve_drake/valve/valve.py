@@ -25,6 +25,7 @@ OPENING = {"counter_clockwise": 1.0, "clockwise": -1.0}  # sense that opens -> i
 FARTHEST = 0.235  # of such a marker from the axis [m]
 LOOK = 0.12  # from such a marker's middle towards the axis, where the head looks [m]
 ALIKE = 0.02  # handles that differ by less look the same to the head's cameras [m]
+LOWEST_MARK = 0.003  # of a green mark over the middle of a handle that is made of the keys [m]
 _UPRIGHT = 0.35  # horizontal part of an axis' direction below which it has no heading of its own
 
 
@@ -140,6 +141,10 @@ class Valve(Config):
         require(round_, f"{key}.handles", "as far from the axis as all others on the rim", [round(r, 4) for r in rims])
         before = self.marker.xyz[2] < self.panel.depth
         require(before, f"{key}.marker.xyz", f"before the panel, z below {self.panel.depth:g}", self.marker.xyz)
+        if not self.model:
+            words = f"at least {LOWEST_MARK:g} on handles that are made of these keys: the marks lie on them"
+            high = self.marker.mark_height
+            require(high >= LOWEST_MARK, f"{key}.marker.mark_height", words, high)
         if self.fixed:
             off = math.hypot(*self.marker.xyz[:2])
             inner = math.ceil(1e3 * (self._outermost() + math.hypot(*self.marker.size) / 2)) / 1e3
