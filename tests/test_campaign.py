@@ -490,6 +490,14 @@ def test_failures_are_a_list_that_is_run_again(tmp_path, edge, monkeypatch, caps
     assert cli.main(["campaign", "--again", "hunt/failures.yaml", "--runs", "2", "--out", "mended", "--json"]) == 0
 
 
+def test_a_long_list_of_a_hunts_failures_can_be_read(tmp_path):
+    draws = [word for k in range(14) for word in ("--set", f"simulation.valve.of_a_long_name_{k}=1.2345678901234567")]
+    record = WHOLE | {"verdict": "slip", "reason": "why" * 20, "command": ["valve-drake", "run", "a #1.yaml", *draws]}
+    failures.write(tmp_path / "list.yaml", [record | {"seed": k} for k in range(2000)])
+    entries = failures.read(tmp_path / "list.yaml")
+    assert len(entries) == 2000 and len(entries[-1].set) == 14 and entries[-1].scenario == "a #1.yaml"
+
+
 def listed(path: Path, *seeds: int) -> str:
     path.write_text("failures: [" + ", ".join(f"{{seed: {seed}}}" for seed in seeds) + "]")
     return str(path)

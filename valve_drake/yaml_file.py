@@ -41,24 +41,26 @@ _SPECIAL = re.compile(r"([-+]?)\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)")
 _STANDARD = "tag:yaml.org,2002:"  # what !! stands for
 
 
-def read(path: str | Path, tags: Tags | None = None, source: str = "") -> Tree:
+def read(path: str | Path, tags: Tags | None = None, source: str = "", room: int = 1) -> Tree:
     """The one document of a file, as `parse` gives it; None for an empty file. `source`: in errors, else the path.
 
+    room: for a file that may be so many times as large as others.
     Raises ConfigError as `parse` does, and if the file cannot be read.
     """
-    return parse(read_text(path, source), source or str(path), tags)
+    return parse(read_text(path, source, room), source or str(path), tags, room)
 
 
-def read_text(path: str | Path, source: str = "") -> str:
+def read_text(path: str | Path, source: str = "", room: int = 1) -> str:
     """The text of a file. Raises ConfigError: no such file, no regular file, larger than MAX_BYTES, not UTF-8."""
+    most = room * MAX_BYTES
     source = source or str(path)
     try:
         if not Path(path).is_file():
             raise ConfigError(f"{source}: no such file")
         with open(path, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise ConfigError(f"{source}: larger than {MAX_BYTES / 1e6:g} MB")
+            data = file.read(most + 1)
+        if len(data) > most:
+            raise ConfigError(f"{source}: larger than {most / 1e6:g} MB")
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{source}: cannot be read: not text in UTF-8") from error
@@ -68,24 +70,24 @@ def read_text(path: str | Path, source: str = "") -> str:
         raise ConfigError(f"{source}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
 
 
-def parse(text: str, source: str, tags: Tags | None = None) -> Tree:
+def parse(text: str, source: str, tags: Tags | None = None, room: int = 1) -> Tree:
     """The one document of a text; None for an empty one. `source` is named in errors.
 
     Raises ConfigError: not YAML, a key that stands twice, an unknown tag or a value that its tag does not allow,
     a number that does not fit into 64 bits, too deep, too long, several documents.
     """
-    trees = documents(text, source, tags)
+    trees = documents(text, source, tags, room)
     if len(trees) > 1:
         raise ConfigError(f"{source} must be one YAML document, got {len(trees)}")
     return trees[0] if trees else None
 
 
-def documents(text: str, source: str, tags: Tags | None = None) -> list[Tree]:
+def documents(text: str, source: str, tags: Tags | None = None, room: int = 1) -> list[Tree]:
     """All documents of a text but the empty ones. Raises ConfigError as `parse` does."""
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         text.encode()  # the library in C cannot say that a text has half a surrogate pair
-        trees = _Builder(yaml.parse(text, Loader=loader), source, tags or {}).documents()
+        trees = _Builder(yaml.parse(text, Loader=loader), source, tags or {}, room * MAX_VALUES).documents()
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         raise ConfigError(f"{source}: not YAML" + (f" (line {mark.line + 1})" if mark else "")) from error
@@ -128,10 +130,11 @@ class _Builder:
     """Makes trees of the parser's events. The library's own constructor is not used: it reads YAML 1.1, takes the last
     of two equal keys, and lets a few aliases stand for gigabytes."""
 
-    def __init__(self, events: Iterator[yaml.Event], source: str, tags: Tags) -> None:
+    def __init__(self, events: Iterator[yaml.Event], source: str, tags: Tags, most: int) -> None:
         self.events = events
         self.source = source
         self.tags = tags
+        self.most = most  # values
         self.values = 0  # so far, with aliases expanded
         self.anchors: dict[str, tuple[Tree, int]] = {}  # name -> its tree, and how many values that is
 
@@ -149,8 +152,8 @@ class _Builder:
 
     def count(self, event: yaml.Event, more: int) -> None:
         self.values += more
-        if self.values > MAX_VALUES:
-            raise self.error(event, "", f"has more than {MAX_VALUES} values, aliases expanded")
+        if self.values > self.most:
+            raise self.error(event, "", f"has more than {self.most} values, aliases expanded")
 
     def tree(self, event: yaml.Event, key: str, depth: int) -> Tree:
         """The tree that begins with `event`; `key` leads to it."""

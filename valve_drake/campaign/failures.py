@@ -10,6 +10,7 @@ from valve_drake.checks import ConfigError
 from valve_drake.config import Config, names, number, plain
 
 MOST = 10_000  # of a list
+ROOM = 30  # for its file, as yaml_file.read has it: an entry of a hunt takes 1.5 kB and a number a draw
 
 
 @dc.dataclass
@@ -31,7 +32,7 @@ class FailureList(Config):
 
 def read(path: Path) -> tuple[Failure, ...]:
     """The entries of a list. Raises ConfigError."""
-    tree = yaml_file.read(path)
+    tree = yaml_file.read(path, room=ROOM)
     if not isinstance(tree, dict) or not tree.get("failures"):
         raise ConfigError(f"{path}: not a list of failures (it has no key failures, or an empty one)")
     found: FailureList = config.build(FailureList(), tree, str(path))
