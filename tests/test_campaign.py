@@ -164,6 +164,17 @@ def test_a_second_call_runs_nothing_again_and_more_runs_go_on(tmp_path, fake):
     assert sorted(map(int, fake.read_text().split())) == [1, 2, 3, 4, 5, 6]
 
 
+def test_a_trial_finds_its_files_from_wherever_it_is_run(tmp_path, fake, monkeypatch):
+    (tmp_path / "fake.py").write_text('open("mine.yaml").close()\n' + FAKE)
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here/mine.yaml").write_text("command: open\n")
+    monkeypatch.chdir(tmp_path / "here")
+    ((one,),) = Campaign(("mine.yaml",), 1, 1, (), tmp_path / "out").batches({})
+    (tmp_path / "out/logs").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)  # as a worker of Dask, which was started elsewhere
+    assert turned(perform(one))
+
+
 def test_records_are_equal_but_for_their_times(tmp_path, fake):
     a, b = run(wanted(tmp_path / "a")), run(wanted(tmp_path / "b"), jobs=1)
     assert [r | {"times": 0} for r in a] == [r | {"times": 0} for r in b]

@@ -128,7 +128,7 @@ class Campaign:
         """given: the scenario with its distributions; what they come to is what the trial draws."""
         log = (self.out / LOGS / f"{name}-{seed}.mcap").resolve()
         resolved = scenario.resolve(dc.replace(scenario.with_overrides(given, overrides), seed=seed))
-        return Trial(name, path, seed, overrides, drawn(given, resolved), log, self.time_out)
+        return Trial(name, path, seed, overrides, drawn(given, resolved), log, self.time_out, os.getcwd())
 
 
 def name_of(path: str) -> str:

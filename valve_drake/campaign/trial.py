@@ -49,6 +49,7 @@ class Trial:
     draws: tuple[tuple[str, float], ...]
     log: Path
     time_out: float  # of the wall clock [s]
+    folder: str = "."  # that its names are relative to: a worker may be in another one
 
     @property
     def key(self) -> str:
@@ -69,6 +70,7 @@ def perform(trial: Trial) -> Record:
     began = time.monotonic()
     process = subprocess.Popen(
         program + options,
+        cwd=trial.folder,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
