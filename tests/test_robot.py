@@ -463,7 +463,12 @@ USELESS = {
         "arms.left.home and arms.right.home must be free of all: left_",
     ),
     "no tilt": ([at("gaze.tilt", "")], [], "gaze.tilt must be given: the search turns the eyes by it"),
-    "hands too small for the valve": ([at("opening", 0.03)], [], "opening must be at least 0.035: valve.handles.width"),
+    "hands too small for the valve": ([at("opening", 0.03)], [], "opening must be at least 0.055: valve.handles.width"),
+    "a handle that open fingers are too near to": (
+        [],
+        ["valve.model=''", "valve.handles=[{xyz: [0.15, 0, 0], width: 0.056}, {xyz: [-0.15, 0, 0]}]"],
+        "opening must be at least 0.086: valve.handles.width and 0.015 to either side (collision.padding), got 0.085",
+    ),
     "a selector that shuts the hands": ([], ["command_selector.gripper_high=0.08"], "opening must be at most command_"),
 }
 

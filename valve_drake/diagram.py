@@ -173,8 +173,11 @@ def robot_of(scenario: Scenario) -> Robot:
         _gaze(scenario.valve_search, robot)
         high, width = scenario.command_selector.gripper_high, max(h.width for h in scenario.valve.handles)
         require(d.opening <= high, "opening", f"at most command_selector.gripper_high, {high:g}", d.opening)
-        least = width + 2 * scenario.hybrid_rotation.grip_margin
-        require(d.opening >= least, "opening", f"at least {least:g}: valve.handles.width and room", d.opening)
+        # Open fingers keep clear of the handle as of all else, and an open hand must not look like one that holds.
+        room = max(scenario.hybrid_rotation.grip_margin, d.collision.padding)
+        least = width + 2 * room
+        words = f"at least {least:g}: valve.handles.width and {room:g} to either side (collision.padding)"
+        require(d.opening >= least - 1e-9, "opening", words, d.opening)
     except ConfigError as error:
         raise ConfigError(f"{scenario.robot}: {error}") from error
     distance = scenario.simulation.start.distance
