@@ -2,6 +2,8 @@
 
 import io
 import json
+import threading
+import time
 import wave
 
 import numpy as np
@@ -9,12 +11,12 @@ import pytest
 from pydrake.lcm import DrakeLcm
 
 from valve_drake import cli
-from valve_drake.checks import ConfigError
+from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.console import console
 from valve_drake.messages import ModeState, OperatorCommand, OperatorPackets, OperatorState, Status
 from valve_drake.operator.desk import KEYS, Desk
 from valve_drake.operator.desk_link import DeskLink
-from valve_drake.operator.ear import PIECE, pieces, read_wav
+from valve_drake.operator.ear import PIECE, Beside, pieces, read_wav
 from valve_drake.operator.grammar import Heard, Kind, parse
 from valve_drake.operator.operator_channel import OperatorChannelConfig, State, step
 from valve_drake.operator.operator_link import OperatorLink
@@ -30,8 +32,8 @@ class Ear:
         self.heard, self.pieces = dict(heard), 0
 
     def push(self, samples):
-        self.pieces += 1
-        return [self.heard[self.pieces]] if self.pieces in self.heard else []
+        self.pieces += bool(len(samples))
+        return [self.heard[self.pieces]] if len(samples) and self.pieces in self.heard else []
 
 
 class Office:
@@ -45,7 +47,7 @@ class Office:
             bus.clock = lambda: self.time
         self.program = OperatorLink(buses[0])
         self.desk = Desk(DeskLink(buses[1], lambda: self.time), ear, clock=lambda: self.time)
-        self.state, self.words = {}, []
+        self.state, self.words, self.beats = {}, [], 0
         self.answer()
 
     def answer(self, **state):
@@ -56,6 +58,7 @@ class Office:
             self.program.tell(OperatorState(speaker=self.desk.link.number, linked=True, **self.state))
             self.desk.poll()
             packets = self.program.take(self.time)
+            self.beats += bool(packets)
             for packet in packets.packets if packets else ():
                 if packet.words and packet.sequence > self.state.get("heard", 0):
                     self.words.append(packet.words)
@@ -143,6 +146,44 @@ def test_what_the_ear_believes_is_said_and_the_rest_too_with_its_score_which_the
     assert office.words == ["robot open", "stop"]
     page = office.page()
     assert "robot open (0.93)" in page and "not clear: stop (0.20)" in page
+
+
+class SlowEar:
+    """It hears nothing until it is let; then the first sample of each piece, as a word."""
+
+    def __init__(self):
+        self.let = threading.Event()
+
+    def push(self, samples):
+        assert self.let.wait(5.0)
+        if samples[0] == 13:
+            raise OperationFailed("the thirteenth")
+        return [Heard(f"word {samples[0]}", 0.9)]
+
+
+def test_a_slow_ear_keeps_the_link_alive_and_its_words_come_in_order_at_last():
+    ear = SlowEar()
+    beside = Beside(ear)
+    office = Office(beside)
+    for k in range(6):
+        office.desk.sound(np.full(1280, k, np.int16))
+        office.answer()
+    assert office.words == [] and office.desk.link.commanding and beside.busy
+    assert office.beats >= 6, "it beat all the time"
+    ear.let.set()
+    for _ in range(3000):
+        office.desk.poll()
+        if not beside.busy:
+            break
+        time.sleep(0.01)
+    said = [line.text for line in office.desk.lines if line.who == "you"]
+    assert said == [f"word {k} (0.90)" for k in range(6)]
+    beside.push(np.full(1, 13, np.int16))
+    with pytest.raises(OperationFailed, match="the thirteenth"):
+        for _ in range(3000):
+            beside.push(np.zeros(0, np.int16))
+            time.sleep(0.01)
+    beside.close()
 
 
 def test_the_sound_reaches_the_program_whole_and_in_order():

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from valve_drake.operator.desk import Desk
     from valve_drake.operator.desk_link import DeskLink
+    from valve_drake.operator.ear import Beside
 
 FRAME = 0.1  # between two pictures [s]
 POLL = 0.01  # between two looks at the wire [s]
@@ -67,13 +68,13 @@ def command(options: argparse.Namespace) -> int:
     scenario = scenarios.load(options.scenario, options.set)
     sound = ear.read_wav(options.file, "--file") if options.file is not None else None
     listens = options.voice is not None or (sound is not None and not options.radio)
-    recogniser = ear.recogniser() if listens else None
+    listener = ear.Beside(ear.recogniser()) if listens else None
     microphone = ear.Microphone() if options.voice == "microphone" else None
     link = DeskLink(Bus(scenario.hardware))
     if options.radio:
         assert sound is not None
         return _send(link, sound)
-    desk = Desk(link, recogniser, send_sound=options.voice != "wire")
+    desk = Desk(link, listener, send_sound=options.voice != "wire")
     alone = link.claim()
     while not alone():  # it listens and says nothing
         link.bus.pump()
@@ -87,8 +88,10 @@ def command(options: argparse.Namespace) -> int:
         desk.poll()
 
     try:
-        return _script(desk, poll, options, sound) if scripted else _sit(desk, poll)
+        return _script(desk, poll, options, sound, listener) if scripted else _sit(desk, poll)
     finally:
+        if listener is not None:
+            listener.close()
         link.leave()
 
 
@@ -172,7 +175,13 @@ def _send(link: "DeskLink", sound: "np.ndarray") -> int:
     return OK
 
 
-def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace, sound: "np.ndarray | None") -> int:
+def _script(
+    desk: "Desk",
+    poll: Callable[[], None],
+    options: argparse.Namespace,
+    sound: "np.ndarray | None",
+    listener: "Beside | None",
+) -> int:
     """Says all that was given, and waits for the end of a run that it began: whoever leaves loses the link.
 
     Exit 0: all was heard, nothing that --say says was refused, and the valve was turned if it was asked for.
@@ -180,6 +189,7 @@ def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace,
     from valve_drake.operator.desk import transcript
     from valve_drake.operator.ear import PIECE, pieces
     from valve_drake.operator.grammar import Heard
+    from valve_drake.operator.wire import RATE
 
     stopped = [False]
     outcomes: list[str] = []
@@ -220,6 +230,8 @@ def _script(desk: "Desk", poll: Callable[[], None], options: argparse.Namespace,
             for k, piece in enumerate(pieces(sound)):
                 until(lambda due=begin + (k + 1) * PIECE: time.monotonic() >= due, 2 * PIECE)  # type: ignore[misc]
                 desk.sound(piece)
+            if listener is not None:
+                until(lambda: not listener.busy, len(sound) / RATE + ANSWER)
             until(lambda: not link.waiting, ANSWER)
         until(lambda: False, 0.3)  # what the robot says last
         begun = link.commanding and link.state.task > 0

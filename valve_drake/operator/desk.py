@@ -30,6 +30,7 @@ KEYS = {
     "r": "reset",
 }
 TYPE, LEAVE, ENTER, ERASE, ESCAPE = "t", "q", "\r\n", "\x7f\b", "\x1b"
+NOTHING = np.zeros(0, np.int16)
 MOST_LINES = 500  # of the conversation that are kept
 COLORS = {"you": "cyan", "robot": "bold", "desk": "yellow"}
 
@@ -46,7 +47,8 @@ class Line:
 class Desk:
     """What one operator sees and says.
 
-    ear: makes words of sound. send_sound: what it hears goes to the robot's log.
+    ear: makes words of sound, of a piece at once or later (ear.Beside). send_sound: what it hears goes to the robot's
+    log.
     """
 
     def __init__(
@@ -83,7 +85,10 @@ class Desk:
         self._level = float(np.sqrt(np.mean((samples / 2**15) ** 2))) if len(samples) else 0.0
         if self._send_sound:
             self.link.sound(samples)
-        for heard in self._ear.push(samples) if self._ear else ():
+        self._hear(samples)
+
+    def _hear(self, samples: np.ndarray) -> None:
+        for heard in self._ear.push(samples) if self._ear is not None and self._begin is not None else ():
             self.say(dc.replace(heard, begin=self._begin + heard.begin, end=self._begin + heard.end))
 
     def press(self, key: str) -> None:
@@ -128,6 +133,7 @@ class Desk:
 
     def poll(self) -> None:
         """Listens and speaks on the wire; to be called some 50 times a second."""
+        self._hear(NOTHING)
         self.link.poll()
         state = self.link.state
         if self.link.program != self._program:  # what it said before was not for this desk

@@ -1,9 +1,11 @@
 """Sound for the operator's desk: where it comes from, in pieces of PIECE seconds, and what makes words of it."""
 
+import collections
 import importlib
 import queue
 import wave
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,9 +27,42 @@ class Recogniser(Protocol):
         """Takes in the next samples (n,) int16 at RATE -> the utterances that they complete, in order.
 
         What is not believed comes too, with a score below grammar.SURE. begin and end: seconds since the first sample.
-        `stop` is told as soon as it is heard, also in the midst of a sentence.
+        `stop` is told as soon as it is heard, also in the midst of a sentence. No samples complete nothing.
         """
         ...
+
+
+class Beside:
+    """A recogniser in a thread of its own: whoever has to answer a robot in time does not wait for it.
+
+    The samples are heard one piece after the other, so that the words and their order are the recogniser's.
+    """
+
+    def __init__(self, recogniser: Recogniser) -> None:
+        self._recogniser = recogniser
+        self._worker = ThreadPoolExecutor(1, "ear")
+        self._pieces: collections.deque[Future[list[Heard]]] = collections.deque()
+
+    def push(self, samples: np.ndarray) -> list[Heard]:
+        """Takes in the next samples (n,) -> the utterances that earlier ones have completed by now, in order.
+
+        Raises what the recogniser raised at one of them.
+        """
+        if len(samples):
+            self._pieces.append(self._worker.submit(self._recogniser.push, samples))
+        out: list[Heard] = []
+        while self._pieces and self._pieces[0].done():
+            out += self._pieces.popleft().result()
+        return out
+
+    @property
+    def busy(self) -> bool:
+        """Some samples are not heard yet, or what they completed was not asked for."""
+        return bool(self._pieces)
+
+    def close(self) -> None:
+        """What is not heard yet never is."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
 
 
 def recogniser() -> Recogniser:
