@@ -127,6 +127,53 @@ def test_the_second_ear_refuses_what_only_sounds_like_stop_and_alone_the_network
     assert [each for _, each in heard(stop_of(0.4)) if each.score >= SURE] == []
 
 
+@pytest.mark.parametrize(
+    "loud, asked", [(range(3, 5), [6]), (range(3, 15), [16]), (range(3, 4), []), (range(3, 16), []), (range(0), [])]
+)
+def test_a_short_burst_of_speech_is_asked_about_one_step_after_its_end_whatever_the_network_says(loud, asked):
+    when = []
+
+    class Notes(Says):
+        def likelihoods(self, back, texts, seconds):
+            when.append(now[0])
+            return super().likelihoods(back, texts, seconds)
+
+    second, memory, now, found = Notes(" Stop."), ears.Memory(), [0], []
+    for k, row in enumerate(silence(20)):
+        now[0] = k
+        memory, out = ears.step(memory, row, k in loud, second)
+        found += [(k, each.text) for each in out if each.score >= SURE]
+    assert when == asked and found == [(k, "stop") for k in asked]
+
+
+def test_after_a_burst_the_second_ear_must_be_surer_than_where_the_network_hears_a_stop_too():
+    between = (ears.STOP_LIKELY + ears.BURST_LIKELY) / 2
+    assert [each for _, each in heard(silence(9), Says(" Stop.", between), loud=(3, 4)) if each.score >= SURE] == []
+    assert [k for k, each in heard(stop_of(0.4), Says(" Stop.", between)) if each.score >= SURE] == [3]
+
+
+def test_a_stop_that_its_burst_told_is_not_told_again_when_the_network_finds_it():
+    p = silence(12)
+    p[7, INDEX["stop"]], p[7, BLANK] = 0.99, 0.01
+    assert [k for k, each in heard(p, Says(" Stop."), loud=(3, 4)) if each.score >= SURE] == [6]
+
+
+def test_a_number_weighs_as_many_words_as_are_spoken():
+    class Same:  # both sentences are as likely to both ears
+        def likelihoods(self, back, texts, seconds):
+            likes = (" By 10 degrees.", " By 150 degrees.")
+            return np.array([-8.0 if text in likes else -60.0 for text in texts])
+
+    p = np.concatenate([spikes("by"), spikes("ten"), spikes("degrees")])
+    known = ears.whole_grammar()
+    even = {text: 1e-3 for text in ("by 10 degrees", "by 150 degrees")}
+    each = np.array([even.get(text, 0.0) for text in known.texts])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ears, "sentence_probabilities", lambda p, sentences: each)
+        text, probability = ears.judged(p, Same(), 1.0)
+    assert text == "by 150 degrees" and probability > 0.8
+
+
 # ---------------------------------------------------------------- where a sentence ends
 
 

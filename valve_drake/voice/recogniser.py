@@ -47,8 +47,8 @@ FOREIGN = 0.07  # weight of all that is no sentence of the grammar; higher: less
 DEAF = 6  # steps after a `stop` or `confirm` in which the same word is not heard again
 ASKED = 10  # sentences that the second ear is asked about; more cost time (20 ms each)
 # ln of a sentence's weight: NETWORK * ln of the network's probability + SECOND * ln of the second ear's + WORD * words.
-NETWORK, SECOND = 0.35, 0.5  # shares of the two ears' evidence; both above 1 would count what they have in common twice
-WORD = 1.0  # for each word, since every word makes a sentence less likely to both; lower: fewer long ones, more short
+NETWORK, SECOND = 0.3, 0.55  # shares of the two ears' evidence; both above 1 would count what they have in common twice
+WORD = 1.2  # for each spoken word, which makes a sentence less likely to both; lower: fewer long ones, more short
 LOWEST = -20.0  # ln of the network's probability counts as no less, or the second ear could not mend what it missed
 ALONE = -2.0  # of the wake phrase alone, with which the others begin; lower: a longer sentence is likelier
 LATE_STOP = -4.5  # instead of the network's part where `stop` was missed; lower: fewer are found, fewer false ones
@@ -56,9 +56,12 @@ ELSE = -5.0  # of all that is no sentence of the grammar; higher: less other spe
 LEAD = 0.8  # of sound before the first word that was noticed: a word is noticed at its end [s]
 FILLED = 6.0  # to which silence fills a sentence up, what the second ear is used to; raise it for longer ones [s]
 # `stop`: the network alone is believed from STOP_SURE; beside a second ear it is asked between these two.
-STOP_MAYBE = 0.08  # lower: fewer are missed, the second ear is asked more often (30 ms each)
+STOP_MAYBE = 0.04  # lower: fewer are missed, the second ear is asked more often (30 ms each)
 STOP_CERTAIN = 0.97  # lower: fewer are missed, more are heard in other words
 STOP_LIKELY = -4.0  # ln of the second ear's probability from which it is one; lower: as above
+# It is asked too one step after a short burst of speech, whatever the network says: the word is noticed sooner so.
+BURST = 2, 12  # steps of such a burst; wider: fewer `stop` within longer speech are missed, more asking
+BURST_LIKELY = -3.4  # instead of STOP_LIKELY there; lower: as above
 STOP_BACK, STOP_FILLED = 1.0, 3.0  # of sound that it is asked about, and to which silence fills it up [s]
 _EARLY = 0.1  # probability of `confirm` from which it is asked whether the sentence is no more than that
 
@@ -137,6 +140,11 @@ class WordNet:
 # ---------------------------------------------------------------- words to sentences
 
 
+def _spoken(text: str) -> list[str]:
+    """Its words, numbers in words: "by 150 degrees" -> by, one, hundred, fifty, degrees."""
+    return " ".join(spelt(int(word)) if word.isdigit() else word for word in text.split()).split()
+
+
 @dc.dataclass(frozen=True)
 class Sentences:
     """Sentences that are listened for. texts: as the grammar reads them. classes: of their words (n, most), 0 beyond
@@ -152,8 +160,7 @@ class Sentences:
         """Words beside the vocabulary must not stand in them; numbers are in digits."""
         spoken = []
         for text in texts:
-            words = " ".join(spelt(int(w)) if w.isdigit() else w for w in text.split()).split()
-            spoken.append([INDEX[word] for word in words if word not in FILLERS])
+            spoken.append([INDEX[word] for word in _spoken(text) if word not in FILLERS])
         classes = np.zeros((len(texts), max(map(len, spoken))), int)
         for k, row in enumerate(spoken):
             classes[k, : len(row)] = row
@@ -264,7 +271,7 @@ def judged(p: np.ndarray, second: SecondEar, back: float) -> tuple[str, float]:
     heard = np.array([np.logaddexp.reduce([next(found) for _ in all_]) for all_ in spellings])
     network = np.append(np.maximum(np.log(np.maximum(each[chosen], 1e-300)), LOWEST) * NETWORK, [LATE_STOP] * 2)
     network += [ALONE * (text == grammar.WAKE) for text in texts]
-    weights = network + SECOND * heard + WORD * np.array([len(text.split()) for text in texts])
+    weights = network + SECOND * heard + WORD * np.array([len(_spoken(text)) for text in texts])
     meanings = np.append(known.meanings[chosen], [known.meanings.max() + 1] * 2)
     total = {m: float(np.logaddexp.reduce(weights[meanings == m])) for m in meanings.tolist()}
     meaning = max(total, key=lambda m: total[m])
@@ -284,15 +291,16 @@ def _sentence(words: np.ndarray, heard: str, second: SecondEar | None, back: flo
     return text if probability >= needed else heard, score(probability, needed)
 
 
-def _stop(probability: float, second: SecondEar | None) -> float:
-    """How sure it is that `stop` has just been said, as a score. probability: the network's."""
+def _stop(probability: float, ended: bool, second: SecondEar | None) -> float:
+    """How sure it is that `stop` has just been said, as a score. probability: the network's. ended: a burst has."""
     if second is None or probability >= STOP_CERTAIN:
         return score(probability, STOP_SURE)
-    if probability < STOP_MAYBE:
+    if probability < STOP_MAYBE and not ended:
         return 0.0
+    needed = STOP_LIKELY if probability >= STOP_MAYBE else BURST_LIKELY
     spellings = [*judges.written("stop"), *judges.written(f"{grammar.WAKE} stop")]
     found = float(second.likelihoods(STOP_BACK, spellings, STOP_FILLED).max())
-    return 1 / (1 + math.exp(STOP_LIKELY - found))
+    return 1 / (1 + math.exp(needed - found))
 
 
 def _without(p: np.ndarray, words: list[str]) -> np.ndarray:
@@ -310,13 +318,16 @@ def _without(p: np.ndarray, words: list[str]) -> np.ndarray:
 class Memory:
     """time: steps so far. said: the probabilities since the sentence began, oldest first; empty: nobody speaks.
 
-    quiet: steps since somebody spoke. wordless: since the last word, within the sentence. since: the step before which
+    loud: steps in which somebody has spoken without a pause. ended: a burst of BURST steps has, one step ago. quiet:
+    steps since somebody spoke. wordless: since the last word, within the sentence. since: the step before which
     all sound belongs to what was heard already. before: the probabilities of the last step. deaf: steps for which
     `stop` and `confirm` are not heard again.
     """
 
     time: int = 0
     said: tuple[np.ndarray, ...] = ()
+    loud: int = 0
+    ended: bool = False
     quiet: int = 0
     wordless: int = 0
     since: int = 0
@@ -340,6 +351,7 @@ def step(
     quiet = 0 if active else m.quiet + 1
     wordless = m.wordless + 1 if idle and m.said else 0
     time, since = m.time + 1, m.since
+    speaks, ended = m.loud + 1 if loud else 0, not loud and BURST[0] <= m.loud <= BURST[1]
     end = (time - quiet) * STEP
     begin = (time - max(len(said), 1)) * STEP
 
@@ -347,7 +359,7 @@ def step(
         return float(1 - (1 - p[INDEX[word]]) * (1 - before[INDEX[word]]))
 
     out: list[Heard] = []
-    stop = _stop(spike("stop"), second)
+    stop = _stop(spike("stop"), m.ended and not deaf_stop, second)
     if stop >= SURE:
         out.append(Heard("stop", stop, begin, time * STEP))
         said, quiet, since, deaf_stop, p = (), 0, time, DEAF, _without(p, ["stop"])
@@ -364,7 +376,7 @@ def step(
             out.append(Heard(*_sentence(words, heard, second, back), begin, end))
             since = time - PAUSE // 2
         said, quiet = (), 0
-    return Memory(time, said, quiet, wordless, since, p, (deaf_stop, deaf_confirm)), tuple(out)
+    return Memory(time, said, speaks, ended, quiet, wordless, since, p, (deaf_stop, deaf_confirm)), tuple(out)
 
 
 # ---------------------------------------------------------------- the whole, on a stream
