@@ -195,6 +195,8 @@ def test_speech_is_louder_than_the_noise_that_it_stands_in():
     loud = [sound.push(block) for block in blocks]
     assert [k for k, each in enumerate(loud) if each] == [30, 31, 32, 33, 34] and sound.second is None
     assert not any(hindsight.Hindsight(None).push(np.zeros(BLOCK, np.int16)) for _ in range(3))
+    faint = hindsight.Hindsight(None)
+    assert not any(faint.push(np.full(BLOCK, level, np.int16)) for level in (0, 0, 1, 4, 16)), "below QUIETEST"
 
 
 def test_the_judge_gets_the_sound_that_was_just_heard():
@@ -249,6 +251,21 @@ def test_whisper_likes_what_was_said_best_and_says_the_same_twice():
         found = judge.likelihoods(sound, asked, 6.0)
         assert found.argmax() == k and (found <= 0).all()
         assert np.array_equal(found, judge.likelihoods(sound, asked, 6.0))
+
+
+@with_whisper
+@with_espeak
+def test_sentences_of_ours_before_it_make_what_was_said_likelier(monkeypatch):
+    from valve_drake.voice.synthesis import Speaker, say
+
+    judge = mut.Judge()
+    monkeypatch.setattr(mut, "BEFORE", "")
+    bare = mut.Judge()
+    sound = pcm(
+        radio.transmit(say("robot, open by ninety degrees", Speaker("espeak", "en-us")), radio.AT_20_DB, seed=1)
+    )
+    with_them, without = (one.likelihoods(sound, [" Robot, open by 90 degrees."], 6.0)[0] for one in (judge, bare))
+    assert with_them > without + 2.0
 
 
 @with_whisper
