@@ -88,7 +88,9 @@ class Desk:
         self._hear(samples)
 
     def _hear(self, samples: np.ndarray) -> None:
-        for heard in self._ear.push(samples) if self._ear is not None and self._begin is not None else ():
+        if self._ear is None or self._begin is None:
+            return
+        for heard in self._ear.push(samples):
             self.say(dc.replace(heard, begin=self._begin + heard.begin, end=self._begin + heard.end))
 
     def press(self, key: str) -> None:
