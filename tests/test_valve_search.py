@@ -41,6 +41,7 @@ class World:
     rate: float = 0.0
     torso: np.ndarray = dc.field(default_factory=lambda: np.array([0.0, 0.1, 0.0]))
     late: float = 0.03  # [s]
+    lag: float = 0.05  # of the torso [s]
     ghosts: float = 0.0  # chance that an image without the marker shows something anywhere in view
     pending: list = dc.field(default_factory=list)
     position: StereoPosition = StereoPosition()
@@ -68,7 +69,7 @@ class World:
         return StereoPosition(t, sequence, True, seen, np.diag(sigma**2), X_OL)
 
     def obey(self, command) -> None:
-        self.torso = self.torso + (command.torso - self.torso) * DT / 0.05
+        self.torso = self.torso + (command.torso - self.torso) * DT / self.lag
         if command.base_twist is not None:
             assert command.base_twist[0] == 0
             self.rate += (command.base_twist[1] - self.rate) * DT / 0.08
@@ -103,6 +104,17 @@ def test_a_fixed_robot_finds_a_valve_within_its_reach_with_the_head_alone(bearin
     assert status.state == "succeeded", status.detail
     assert np.linalg.norm(memory.target - p_OV) < 0.04 and time < 35
     assert world.base.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("pan", [0.7, 1.0, 1.3, 1.37])
+def test_a_head_that_turns_little_leaves_no_direction_out(pan):
+    """Without a waist, and with a neck that follows late: turns of the base close what the sweeps leave open."""
+    config = dc.replace(CONFIG, sweep_yaw=pan, yaw_limit=pan, sweep_waist=0.0, pitches=[CONFIG.pitches[0]])
+    for bearing in np.linspace(-np.pi, np.pi, 12, endpoint=False):
+        world = World(around(bearing + 0.03, 3.0, 1.0), np.random.default_rng(3), lag=0.2)
+        status, time, torsos, _ = search(world, config=config)
+        assert status.state == "succeeded", (bearing, status.detail)
+        assert np.abs(torsos[:, 2]).max() <= pan and time < 45
 
 
 def test_a_fixed_robot_that_sees_nothing_says_so_within_the_modes_deadline():

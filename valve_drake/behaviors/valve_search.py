@@ -3,9 +3,10 @@
 Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base while searching.
 
     search   The gaze (waist + neck yaw) sweeps to one end and across, the base turns by half a turn to that side, so
-             that the gaze goes on over what is new, and it sweeps back: that is a round, one for each neck pitch in
-             `pitches`. A sighting stops the sweep and is centred; it counts when the last `sightings` of stage 1 agree
-             within 3 sigma or 5 % of the distance, else the sweep goes on. Fails with not_found after the last round.
+             that the gaze goes on over what is new, and it sweeps back (three sweeps and thirds of a turn if the gaze
+             does not reach so far, and so on): that is a round, one for each neck pitch in `pitches`. A sighting stops
+             the sweep and is centred; it counts when the last `sightings` of stage 1 agree within 3 sigma or 5 % of the
+             distance, else the sweep goes on. Fails with not_found after the last round.
              The gaze waits for images, so that a slow camera makes the search slower and not blind.
              A fixed base does not turn: then a round is one sweep, and the rounds go on downwards as far as the head
              does, since a valve that such a robot can reach is near (`bolted`).
@@ -48,6 +49,7 @@ HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading
 MOVED = (
     0.03  # a valve that is seen so far from where it was measured may have been moved; estimates scatter by 2 mm [m]
 )
+VIEW = 0.2  # a marker so far beside the optical axis is seen whole; lower it for longer lenses [rad]
 LOWER = 0.22  # between two rounds of a fixed robot, less than the eyes see at once; lower it for longer lenses [rad]
 DRIVING = tuple(mode for mode in WATCHED if TABLE[mode].base != HOLD)
 
@@ -166,7 +168,7 @@ class Memory:
     sweeps: int = -1  # completed across; -1: on the way to the first end
     side: float = 1.0  # the end it is moving to
     gaze: float = 0.0  # waist + neck yaw asked for [rad]
-    to_turn: float = 0.0  # left of the base's half turn, positive to the left [rad]
+    to_turn: float = 0.0  # left of the base's turn between two sweeps, positive to the left [rad]
     heading: float = 0.0  # of the base at the previous step [rad]
     turn_rate: float = 0.0  # commanded [rad/s]
     looks: tuple[tuple[np.ndarray, float], ...] = ()  # p_OV [m] and its sigma [m], of the last sightings
@@ -230,7 +232,7 @@ def step(
 
     twist = None
     if mode.mode == Mode.SEARCH:
-        m, goal = _search(config, m, time, dt, base, position, head_pose, _sweeps(drive))
+        m, goal = _search(config, m, time, dt, base, position, head_pose, _sweeps(config, drive))
         twist = None if drive.fixed else drive.part(np.array([0.0, 0.0, m.turn_rate]))
     else:
         m = _sight(config, m, position, estimate)
@@ -248,7 +250,7 @@ def step(
     ]
     torso, velocity = np.array(new), np.array([(after - before) / dt for after, before in zip(new, now)])
     m = changed(m, torso=torso, velocity=velocity, goal=goal)
-    return m, Command(time=time, torso=torso, base_twist=twist), _status(config, m, time, mode, _sweeps(drive))
+    return m, Command(time=time, torso=torso, base_twist=twist), _status(config, m, time, mode, _sweeps(config, drive))
 
 
 def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
@@ -296,9 +298,11 @@ def bolted(config: ValveSearchConfig) -> ValveSearchConfig:
     return dc.replace(config, pitches=[*first, *steeper, *rest])
 
 
-def _sweeps(drive: Drive) -> int:
-    """Of a round."""
-    return 1 if drive.fixed else 2
+def _sweeps(config: ValveSearchConfig, drive: Drive) -> int:
+    """Of a round: as many as see all round, from as many headings of the base."""
+    if drive.fixed:
+        return 1
+    return math.ceil(np.pi / (config.sweep_yaw + config.sweep_waist + VIEW))
 
 
 def _status(config: ValveSearchConfig, m: Memory, time: float, mode: ModeState, sweeps: int) -> Status:
@@ -449,9 +453,13 @@ def _sweep(config: ValveSearchConfig, m: Memory, dt: float, heading: float, roun
         return m, goal
     gaze = slew(m.gaze, m.side * end, config.sweep_speed * dt)
     m = changed(m, gaze=float(gaze))
-    if gaze == m.side * end:
+    # It does not turn back before its images join those of the next sweep.
+    unseen = m.side * wrap(heading + m.gaze - m.seen_azimuth)
+    if gaze == m.side * end and unseen <= max(end + VIEW - np.pi / round_, 0.1):
         sweeps = m.sweeps + 1
-        m = changed(m, sweeps=sweeps, side=-m.side, to_turn=m.side * np.pi if sweeps % round_ == 1 else 0.0)
+        onward = m.side if sweeps % round_ % 2 else -m.side  # every turn of a round goes the same way
+        turn = onward * 2 * np.pi / round_ if sweeps % round_ else 0.0
+        m = changed(m, sweeps=sweeps, side=-m.side, to_turn=turn)
         if sweeps == round_ * len(config.pitches):
             where = "all round" if round_ > 1 else "as far as the head turns"
             m = _end(m, "failed", Verdict.NOT_FOUND, f"no marker in {sweeps} sweeps {where}")
