@@ -21,7 +21,7 @@ from valve_drake.behaviors.closed_chain import (
     turn_rate,
     twists,
 )
-from valve_drake.behaviors.grasp_geometry import Turn
+from valve_drake.behaviors.grasp_geometry import Turn, standoff
 from valve_drake.behaviors.hybrid_rotation import HybridRotation, Memory
 from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
@@ -870,13 +870,41 @@ def test_block_clones_are_independent():
     assert_clones_are_independent(rig, change, ("command", "status", "turn"))
 
 
-def test_a_redundant_arm_keeps_to_the_way_that_was_planned():
-    """Left to itself its elbow wanders from tick to tick, away from what is known to be free of collision."""
+@pytest.fixture(scope="module")
+def pr2_at_the_valve():
+    """The PR2, the valve in its base, its lift, the arc of a quarter turn, and what a plan says of its joints."""
     pr2 = Robot.load(description.find("pr2/pr2.robot.yaml"))
     X_OA = compose(panel_pose(ValveConfig(height=1.17)), inverse(VALVE.X_AP()))
     X_BA, posture = compose(inverse(planar(-0.85, 0, 0)), X_OA), np.array([0.23])
     arc = Stances(pr2, VALVE, StanceConfig(), VIEW, lambda *_: True).best_arc(Turn(X_BA, QUARTER, posture=posture))
     both = {name: np.hstack([getattr(arc, name)[side] for side in SIDES]).ravel() for name in ("q_standoff", "way")}
+    return pr2, X_BA, posture, arc, both
+
+
+def test_redundant_arms_draw_back_as_it_was_planned(pr2_at_the_valve):
+    """Their elbows go where the plan has looked for collisions, not where the posture draws them tick by tick."""
+    pr2, X_BA, posture, arc, both = pr2_at_the_valve
+    law = HybridRotation(CONFIG, VALVE, pr2, VIEW)
+    end = tuple(arc.way[side][-1] for side in SIDES)
+    X = tuple(pr2.forward(side, end[k], posture) for k, side in enumerate(SIDES))
+    backs = [standoff(X[k], VIEW[side], CONFIG.retreat) for k, side in enumerate(SIDES)]
+    planned = [pr2.inverse(side, backs[k], end[k], posture) for k, side in enumerate(SIDES)]
+    state = RobotState(torso=np.array([*posture, 0, 0]), left_gripper=pr2.opening, right_gripper=pr2.opening)
+    chain = make_chain(np.array([X[0][:, 3], X[1][:, 3]]), np.zeros((2, 6)), -X_BA[:, 2], np.zeros(2))
+    plan = GraspPlan(found=True, turn=arc.turn, **both)
+    m = Memory(plan=plan, q=end, X=X, turned=arc.turn, stage="open", since=0.0)
+    for tick in range(200):
+        m, V, _ = law._release(tick * TICK, TICK, m, state, ModeState(mode="release"), chain)
+        m = law._move(TICK, m, V, chain, posture)
+    assert m.stage == "away"
+    for k, side in enumerate(SIDES):
+        assert pr2.forward(side, m.q[k], posture) == pytest.approx(backs[k], abs=1e-4)
+        assert np.abs(m.q[k] - planned[k]).max() < 0.04
+
+
+def test_a_redundant_arm_keeps_to_the_way_that_was_planned(pr2_at_the_valve):
+    """Left to itself its elbow wanders from tick to tick, away from what is known to be free of collision."""
+    pr2, X_BA, posture, arc, both = pr2_at_the_valve
     law = HybridRotation(CONFIG, VALVE, pr2, VIEW)
     off = {}
     for name, way in (("planned", both["way"]), ("alone", np.zeros(0))):

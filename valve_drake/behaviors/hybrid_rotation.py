@@ -122,6 +122,8 @@ class HybridRotation(Grasping, Turning, Releasing):
             stage=stage,
             since=time,
             start=m.X,
+            behind=(None, None),
+            back=0.0,
             rate=0.0,
             progress_at=(time, 0.0),
             stalls=0,

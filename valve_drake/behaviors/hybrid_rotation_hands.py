@@ -9,6 +9,7 @@ from valve_drake.behaviors.axis_estimate import AxisEstimate
 from valve_drake.behaviors.closed_chain import (
     Chain,
 )
+from valve_drake.behaviors.grasp_geometry import standoff
 from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
 from valve_drake.frames import cross, make, rotation
 from valve_drake.memory import changed
@@ -46,6 +47,9 @@ class Memory:
     X: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # commanded X_BG
     q: Pair = dc.field(default_factory=lambda: _pair(6))  # commanded joints
     start: Pair = dc.field(default_factory=lambda: _pair(3, 4))  # X_BG at the stage's beginning
+    # Where redundant arms end when the hands are drawn back (joints; None: not known), and the share of the way there.
+    behind: tuple[np.ndarray | None, ...] = (None, None)
+    back: float = 0.0
     plan: GraspPlan = GraspPlan()  # of this grasp
     axis: AxisEstimate | None = None  # none before the first grasp
     u: np.ndarray = dc.field(default_factory=lambda: np.array([-1.0, 0.0, 0.0]))  # the valve's axis, towards the robot
@@ -130,12 +134,28 @@ class Hands:
     def _near(self, m: Memory, k: int) -> np.ndarray:
         """From where hand k's joints are looked for. A redundant arm is drawn to the way that was planned, since only
         that is known to be free of collision: left to itself its elbow wanders as the hand goes on."""
+        planned, behind = self._planned(m, k), m.behind[k]
+        if planned is None:
+            return m.q[k]
+        if behind is not None:
+            planned = planned + m.back * (behind - planned)
+        return m.q[k] + DRAWN * (planned - m.q[k])
+
+    def _planned(self, m: Memory, k: int) -> np.ndarray | None:
+        """The joints of hand k's arm by the plan where the valve is now; None for an arm that is not redundant."""
         plan, count = m.plan, len(m.q[k])
         if count <= 6 or not plan.way.size or not plan.turn:
-            return m.q[k]
+            return None
         way = plan.way.reshape(-1, len(plan.q_standoff))
         way = way[:, :count] if k == 0 else way[:, -count:]
         at = min(max(m.turned / plan.turn, 0.0), 1.0) * (len(way) - 1)
         row = min(int(at), len(way) - 2)
-        planned = way[row] + (at - row) * (way[row + 1] - way[row])
-        return m.q[k] + DRAWN * (planned - m.q[k])
+        return way[row] + (at - row) * (way[row + 1] - way[row])
+
+    def _behind(self, m: Memory, posture: np.ndarray) -> tuple[np.ndarray | None, ...]:
+        """The joints of redundant arms with the hands drawn back, as the plan looked for them: from its way at once."""
+        out: list[np.ndarray | None] = []
+        for k, side in enumerate(SIDES):
+            planned, X = self._planned(m, k), standoff(m.X[k], self.view[side], self.config.retreat)
+            out.append(None if planned is None else self.robot.inverse(side, X, planned, posture))
+        return tuple(out)

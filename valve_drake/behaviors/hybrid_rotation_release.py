@@ -38,12 +38,12 @@ class Releasing(Hands):
         if m.stage == "open":
             wide = min(state.left_gripper, state.right_gripper) > 0.9 * self.robot.opening
             if wide or time - m.since > 2.0:
-                m = changed(m, stage="retreat", since=time, start=m.X)
+                m = changed(m, stage="retreat", since=time, start=m.X, behind=self._behind(m, state.posture))
             return m, V, opened
         if m.stage == "retreat":
             way = min(c.retreat, c.retreat_speed * (time - m.since))
             left, right = (standoff(m.start[k], self.view[side], way) for k, side in enumerate(SIDES))
-            m = self._command(m, (left, right), state.posture)
+            m = self._command(changed(m, back=way / c.retreat), (left, right), state.posture)
             if way >= c.retreat:
                 status = Status(time, m.activation, "succeeded", progress=1.0, value=m.plan.turned + m.turned)
                 m = changed(m, stage="away", status=status)
