@@ -166,8 +166,9 @@ def test_a_slow_ear_keeps_the_link_alive_and_its_words_come_in_order_at_last():
     beside = Beside(ear)
     office = Office(beside)
     for k in range(6):
-        office.desk.sound(np.full(1280, k, np.int16))
+        office.desk.sound(np.full(4000, k, np.int16))
         office.answer()
+    assert "hears 1.5 s late" in office.page(width=120)
     assert office.words == [] and office.desk.link.commanding and beside.busy
     assert office.beats >= 6, "it beat all the time"
     ear.let.set()
@@ -176,6 +177,7 @@ def test_a_slow_ear_keeps_the_link_alive_and_its_words_come_in_order_at_last():
         if not beside.busy:
             break
         time.sleep(0.01)
+    assert "late" not in office.page(width=120)
     said = [line.text for line in office.desk.lines if line.who == "you"]
     assert said == [f"word {k} (0.90)" for k in range(6)]
     beside.push(np.full(1, 13, np.int16))

@@ -9,7 +9,7 @@ import numpy as np
 
 from valve_drake.console import styled
 from valve_drake.operator.desk_link import DeskLink
-from valve_drake.operator.ear import Recogniser
+from valve_drake.operator.ear import Beside, Recogniser
 from valve_drake.operator.grammar import SURE, Heard, Kind, parse
 from valve_drake.operator.operator_channel import tag
 from valve_drake.operator.wire import RATE
@@ -30,6 +30,7 @@ KEYS = {
     "r": "reset",
 }
 TYPE, LEAVE, ENTER, ERASE, ESCAPE = "t", "q", "\r\n", "\x7f\b", "\x1b"
+LATE = 1.0  # of sound that waits to be heard, from which the page says so [s]
 NOTHING = np.zeros(0, np.int16)
 MOST_LINES = 500  # of the conversation that are kept
 COLORS = {"you": "cyan", "robot": "bold", "desk": "yellow"}
@@ -193,7 +194,10 @@ class Desk:
     def _sees(self) -> "RenderableType":
         state = self.link.state
         ear = f"   ear {'#' * min(int(40 * self._level), 20):<20}" if self._ear is not None else ""
-        return styled(("sees ", "dim"), f"{state.sees or '-':<40}" if self.link.linked else "", (ear, "dim"))
+        late = self._ear.late if isinstance(self._ear, Beside) else 0.0
+        slow = f" hears {late:.1f} s late" if late > LATE else ""
+        sees = f"{state.sees or '-':<40}" if self.link.linked else ""
+        return styled(("sees ", "dim"), sees, (ear, "dim"), (slow, "bold red"))
 
     def _keys(self) -> "RenderableType":
         if self.typing is not None:

@@ -41,7 +41,7 @@ class Beside:
     def __init__(self, recogniser: Recogniser) -> None:
         self._recogniser = recogniser
         self._worker = ThreadPoolExecutor(1, "ear")
-        self._pieces: collections.deque[Future[list[Heard]]] = collections.deque()
+        self._pieces: collections.deque[tuple[Future[list[Heard]], int]] = collections.deque()  # and their samples
 
     def push(self, samples: np.ndarray) -> list[Heard]:
         """Takes in the next samples (n,) -> the utterances that earlier ones have completed by now, in order.
@@ -49,16 +49,21 @@ class Beside:
         Raises what the recogniser raised at one of them.
         """
         if len(samples):
-            self._pieces.append(self._worker.submit(self._recogniser.push, samples))
+            self._pieces.append((self._worker.submit(self._recogniser.push, samples), len(samples)))
         out: list[Heard] = []
-        while self._pieces and self._pieces[0].done():
-            out += self._pieces.popleft().result()
+        while self._pieces and self._pieces[0][0].done():
+            out += self._pieces.popleft()[0].result()
         return out
 
     @property
     def busy(self) -> bool:
         """Some samples are not heard yet, or what they completed was not asked for."""
         return bool(self._pieces)
+
+    @property
+    def late(self) -> float:
+        """How much sound waits to be heard [s]."""
+        return sum(count for _, count in self._pieces) / RATE
 
     def close(self) -> None:
         """What is not heard yet never is."""
