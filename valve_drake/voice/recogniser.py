@@ -11,7 +11,8 @@ robot is refused by that. `stop` does not wait for the end of a sentence, nor fo
 end.
 
 Where the packages of judge.py are installed, a second ear is asked: at a sentence's end, how likely the network's
-likeliest sentences are in its sound; at a word that may be `stop`, whether it is. Without them the network decides.
+likeliest sentences are in its sound; at a word that may be `stop`, and after any short burst of speech, whether it was
+`stop`. Without them the network decides.
 """
 
 import dataclasses as dc
