@@ -1,7 +1,9 @@
 """check-robot: what it says of our robot, of robots that lack something, and of real ones of installed wheels."""
 
 import json
+import shutil
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -179,7 +181,7 @@ REAL = {
             (DOUBTFUL, "grasp grippers.left: its motor closes with"),
             (NOTE, "grasp opening: the fingers open by 71 mm"),
         ],
-        {0.5: False, 0.81: True, 1.0: True, 1.2: True},
+        {0.5: False, 1.2: True},
     ),
     "baxter": (
         BAXTER,
@@ -187,7 +189,7 @@ REAL = {
             (MISSING, "search gaze.tilt: no joint turns the eyes up and down"),
             (NOTE, "approach base.drive: fixed"),
             (DOUBTFUL, "grasp opening: the fingers open by 42 mm"),
-            (MISSING, "reach collision: links in the way are all that keeps it from"),
+            (MISSING, "reach arms.*.work: no valve is turned by a quarter"),
         ],
         {0.5: False, 1.2: False},
     ),
@@ -228,3 +230,24 @@ def test_real_robots_of_installed_wheels_are_imported_and_judged(name, tmp_path,
     assert {height: served[height] for height in reach} == reach
     assert page.read_text().count("data:image/png") >= 2
     assert yaml_file.read(file)["model"].endswith(".urdf") and np.isfinite(found["processor_s"])
+
+
+@pytest.mark.robots
+def test_tiago_pro_filled_in_reaches_what_its_draft_does_not(tmp_path, monkeypatch, capsys):
+    """examples/tiago_pro.robot.yaml beside the imported model, as docs/your_robot.md has it."""
+    pytest.importorskip("trimesh")
+    try:
+        packages.resolve(TIAGO, None, "MODEL")
+    except ConfigError as error:
+        pytest.skip(str(error))
+    reach = {0.81: True, 1.0: True, 1.2: True, 1.6: False}
+    monkeypatch.setattr(robot_check, "HEIGHTS", tuple(reach))
+    assert cli.main(["import-robot", TIAGO, "-o", str(tmp_path / "tiago_pro")]) == 0
+    capsys.readouterr()
+    file = tmp_path / "tiago_pro" / "robot.yaml"
+    shutil.copy(Path(__file__).parents[1] / "examples" / "tiago_pro.robot.yaml", file)
+    cli.main(["check-robot", str(file), "--json", "--html", str(tmp_path / "page.html")])
+    found = json.loads(capsys.readouterr().out)
+    served = {row["height"]: row["serves"] for row in found["reach"]}
+    assert {height: served[height] for height in reach} == reach, found["reach"]
+    assert not [f for f in found["findings"] if f["level"] == MISSING], found["findings"]
