@@ -43,6 +43,10 @@ def test_it_finds_the_valve_within_a_second_and_the_log_has_its_own_joints(tmp_p
         assert reader.topics[topic].count > 0, topic
     layout = reader.attachments["layout.json"].data.decode()
     assert "l_shoulder_pan_joint" in layout and "left_arm_1" not in layout
+    # Its body is drawn where it is: the frames of its shapes move with those of the joints.
+    drawn = {entity.frame_id for _, _, m in reader.messages(["/scene"]) for entity in m.entities}
+    moved = {t.child_frame_id for _, _, m in reader.messages(["/tf"]) for t in m.transforms}
+    assert any("wrist" in frame for frame in drawn) and drawn - moved <= {"valve::panel", "valve::wheel"}
 
 
 class Rig:

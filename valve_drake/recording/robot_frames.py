@@ -14,7 +14,8 @@ ODOMETRY = "odometry"
 
 
 class RobotFrames:
-    """The controllers' model of the robot in its measured pose. Frames are named as in SceneGraph ("robot::chest")."""
+    """The controllers' model of the robot in its measured pose. Frames are named as in SceneGraph, after the model
+    ("robot::chest"), so that the bodies' looks move with them."""
 
     def __init__(self, robot: Robot, head: StereoHead):
         self._model = shared = robot.model
@@ -23,11 +24,11 @@ class RobotFrames:
         self._q = np.array(self._plant.GetPositions(self._context))
         self._poses = self._plant.get_body_poses_output_port()
         self._bodies = {
-            int(i): f"robot::{self._plant.get_body(i).name()}" for i in self._plant.GetBodyIndices(instance)
+            int(i): self._plant.get_body(i).scoped_name().get_full() for i in self._plant.GetBodyIndices(instance)
         }
         eye = self._plant.GetFrameByName(robot.description.cameras["head_left"], instance)
         self._constant = [
-            (f"robot::{eye.body().name()}", "head_left", eye.GetFixedPoseInBodyFrame().GetAsMatrix34()),
+            (eye.body().scoped_name().get_full(), "head_left", eye.GetFixedPoseInBodyFrame().GetAsMatrix34()),
             ("head_left", "head_right", head.X_LR),
         ]
         self._valve = valve = shared.shape
