@@ -366,6 +366,22 @@ def test_fine_approach_does_not_wait_for_a_search_without_a_pose():
     assert run.time == pytest.approx(CONFIG.stance_patience, abs=0.1)
 
 
+def test_fine_approach_does_not_wait_for_a_marker_that_is_seen_no_more():
+    scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
+    run = drive(
+        Mode.FINE_APPROACH,
+        Wheels(place(scene, 0.0, 1.6)),
+        scene,
+        alter=lambda t, seen: (
+            seen[0],
+            seen[1] if t < 2.0 else RectangleEstimate(time=t),
+            Stance(time=1.0, found=True, base=np.zeros(3)) if t > 1.5 else Stance(),
+        ),
+    )
+    assert (run.status.verdict, run.status.detail) == (Verdict.REACH_LIMIT, "no stance: the marker's pose is not known")
+    assert 2.0 + CONFIG.stance_patience - 0.5 < run.time < 2.0 + CONFIG.stance_patience + 0.1
+
+
 def test_fine_approach_gives_up_after_its_attempts():
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0)
 

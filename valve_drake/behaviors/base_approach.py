@@ -334,8 +334,10 @@ def _fine(
     if stance.found and stance.time > m.stance.seen:
         m = changed(m, stance=m.stance.add(stance.time, stance.base, config.sightings), posture=stance.posture)
     if not (_sure(config, m.panel) and _sure(config, m.stance)):
-        # A search that is under way ends by itself, sooner or later by how many joints and places there are.
-        under_way = _sure(config, m.panel) and not stance.reason
+        # A search that is under way ends by itself, sooner or later by how many joints and places there are; without a
+        # marker in sight none is.
+        seen = time - m.panel.seen <= config.stance_patience
+        under_way = seen and _sure(config, m.panel) and not stance.reason
         if time - m.since > config.stance_patience and not under_way:
             return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
         return changed(m, detail="waiting for a stance"), STILL

@@ -46,9 +46,8 @@ from valve_drake.task.modes import FIXED, HOLD, TABLE, WATCHED
 
 HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading) in O, torso (3,) -> X_OL (3, 4)
 
-MOVED = (
-    0.03  # a valve that is seen so far from where it was measured may have been moved; estimates scatter by 2 mm [m]
-)
+# A valve that is seen so far from where it was measured may have been moved; estimates scatter by 2 mm [m].
+MOVED = 0.03
 VIEW = 0.2  # a marker so far beside the optical axis is seen whole; lower it for longer lenses [rad]
 LOWER = 0.22  # between two rounds of a fixed robot, less than the eyes see at once; lower it for longer lenses [rad]
 DRIVING = tuple(mode for mode in WATCHED if TABLE[mode].base != HOLD)
