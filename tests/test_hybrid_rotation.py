@@ -30,11 +30,14 @@ from valve_drake.behaviors.stance_search import Stances
 from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, cross, inverse, make, planar, rot_y, rot_z, rotation, rotation_vector
 from valve_drake.messages import LEFT, RIGHT, SIDES, Command, GraspPlan, Mode, ModeState, RobotState, Status
+from valve_drake.motion import follow
 from valve_drake.ports import TICK
 from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
+from valve_drake.supervisor.command_selector import CommandSelectorConfig
+from valve_drake.task.modes import DEADLINES
 from valve_drake.valve.valve import HandleConfig, Valve, turned
 
 CONFIG = HybridRotationConfig()
@@ -900,6 +903,36 @@ def test_redundant_arms_draw_back_as_it_was_planned(pr2_at_the_valve):
     for k, side in enumerate(SIDES):
         assert pr2.forward(side, m.q[k], posture) == pytest.approx(backs[k], abs=1e-4)
         assert np.abs(m.q[k] - planned[k]).max() < 0.04
+
+
+@pytest.mark.parametrize("elbow, quick", [(-0.17, False), (-0.5, False), (-1.2, True)])
+def test_hands_are_drawn_back_no_faster_than_the_joints_can_follow(elbow, quick, pr2_at_the_valve):
+    """An elbow that is nearly straight bends fast for a small way: one that lags swings the hand off its line."""
+    pr2, X_BA, posture = pr2_at_the_valve[:3]
+    law = HybridRotation(CONFIG, VALVE, pr2, VIEW)
+    right = np.array([0.149, -0.391, -1.176, elbow, -2.48, -0.683, 0.634])
+    q = (right * [-1, 1, -1, 1, -1, 1, -1], right)
+    X = tuple(pr2.forward(side, q[k], posture) for k, side in enumerate(SIDES))
+    state = RobotState(torso=np.array([*posture, 0, 0]), left_gripper=pr2.opening, right_gripper=pr2.opening)
+    chain = make_chain(np.array([X[0][:, 3], X[1][:, 3]]), np.zeros((2, 6)), -X_BA[:, 2], np.zeros(2))
+    limits = [(speed, CommandSelectorConfig().acceleration_arm) for side in SIDES for speed in pr2.arms[side].speed]
+    m = Memory(plan=GraspPlan(found=True), q=q, X=X, stage="retreat", start=X, since=0.0)
+    last, at, rate, ticks = np.concatenate(q), np.concatenate(q), np.zeros(14), 0
+    while m.stage == "retreat":
+        ticks += 1
+        m, _, _ = law._release(ticks * TICK, TICK, m, state, ModeState(mode="release"), chain)
+        asked = np.concatenate(m.q)
+        goals = zip(asked, (asked - last) / TICK, at, rate, limits)
+        went = np.array([follow(goal, by, now, v, *limit, TICK) for goal, by, now, v, limit in goals])
+        last, at, rate = asked, went, (went - at) / TICK
+        for k, side in enumerate(SIDES):
+            off = pr2.forward(side, at[7 * k : 7 * k + 7], posture)[:, 3] - X[k][:, 3]
+            line = X[k][:, :3] @ VIEW[side]
+            assert np.linalg.norm(off - line * (line @ off)) < 0.005  # of what the selector lets pass [m]
+    for k, side in enumerate(SIDES):
+        assert m.X[k] == pytest.approx(standoff(X[k], VIEW[side], CONFIG.retreat), abs=1e-4)
+    assert (ticks * TICK < CONFIG.retreat / CONFIG.retreat_speed + 0.02) == quick
+    assert ticks * TICK < DEADLINES["release"] / 3
 
 
 def test_a_redundant_arm_keeps_to_the_way_that_was_planned(pr2_at_the_valve):

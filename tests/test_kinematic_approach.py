@@ -457,6 +457,20 @@ def test_the_camera_decides_whether_it_turned(base, true, hands, commanded, stat
     assert f"{np.degrees(status.value):.2f} deg" in status.detail
 
 
+@pytest.mark.parametrize("seen, hands", [(QUARTER - 0.05, QUARTER), (QUARTER + 0.05, QUARTER), (1.2, QUARTER)])
+def test_after_a_slip_the_grasps_are_planned_for_what_the_camera_still_misses(base, seen, hands):
+    """The valve went back, or on, as the hands let go; or the pads slid on the handles, and the hands felt a turn."""
+    bench, status = verify(base, seen, hands)
+    assert (status.state, status.verdict, status.cause) == ("failed", "slip", "")
+    assert bench.run(Mode.MEASURE, turn_angle=QUARTER).state == "succeeded"
+    assert bench.memory.request.turn_angle == pytest.approx(QUARTER - seen, abs=0.004)
+    assert bench.memory.plan.turned == pytest.approx(seen, abs=0.004)  # what the hands felt is forgotten
+    bench.turn = bench.felt(QUARTER)
+    bench.X_OA = turned(X_OA, QUARTER)
+    bench.run(Mode.FOLD, turn_angle=QUARTER)
+    assert bench.run(Mode.VERIFY, turn_angle=QUARTER).state == "succeeded"
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_a_rectangle_that_looks_alike_after_part_of_a_turn_is_counted_by_the_hands(base, known):
     """Green marks repeat every half turn, the rectangle alone every quarter."""

@@ -223,6 +223,7 @@ def test_every_entry_into_a_mode_is_a_new_activation():
         (Mode.GRASP, "grasp_missed", "", [Mode.RELEASE, Mode.FOLD, Mode.MEASURE, Mode.REACH], 2),
         (Mode.REACH, "marker_lost", "moved", [Mode.FOLD, Mode.MEASURE, Mode.REACH], 2),
         (Mode.SERVO, "marker_lost", "moved", [Mode.RELEASE, Mode.FOLD, Mode.MEASURE, Mode.REACH], 2),
+        (Mode.VERIFY, "slip", "", [Mode.MEASURE, Mode.REACH, Mode.SERVO, Mode.GRASP, Mode.TURN], 2),
     ],
 )
 def test_what_may_be_tried_again_is_tried_again_and_only_so_often(mode, verdict, cause, again, retries):
@@ -402,6 +403,15 @@ def test_a_turn_that_succeeded_fails_if_the_camera_says_so():
     state = bring_to(Mode.TURN).until_end(fail_in(Mode.VERIFY, "slip", "camera sees 40 deg"))
     assert (state.mode, state.verdict) == (Mode.FAILED, Verdict.SLIP)
     assert "40 deg" in state.reason
+
+
+@pytest.mark.parametrize("verdict", ["end_stop", "stuck"])
+def test_a_run_that_fails_anyhow_is_not_turned_on_because_the_camera_sees_another_angle(verdict):
+    bench = bring_to(Mode.TURN)
+    bench.tick(lambda s: {OWNER[s.mode]: {"state": "failed", "verdict": verdict}})
+    state = bench.until_end(fail_in(Mode.VERIFY, "slip", "camera sees 40 deg"))
+    assert (state.mode, state.verdict) == (Mode.FAILED, verdict)
+    assert bench.modes.count(Mode.VERIFY) == bench.modes.count(Mode.TURN) == 1
 
 
 def test_a_retreat_that_fails_after_turning_fails_the_run():

@@ -11,6 +11,8 @@ All vectors are in the base's frame B, which stands still while the hands are on
 the hands are where they are measured.
 """
 
+import math
+
 import numpy as np
 
 from valve_drake.behaviors.axis_estimate import AxisEstimate
@@ -124,6 +126,7 @@ class HybridRotation(Grasping, Turning, Releasing):
             start=m.X,
             behind=(None, None),
             back=0.0,
+            pace=math.inf,
             rate=0.0,
             progress_at=(time, 0.0),
             stalls=0,

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses as dc
+import math
 
 import numpy as np
 
@@ -50,6 +51,7 @@ class Memory:
     # Where redundant arms end when the hands are drawn back (joints; None: not known), and the share of the way there.
     behind: tuple[np.ndarray | None, ...] = (None, None)
     back: float = 0.0
+    pace: float = math.inf  # of that way, if the joints could not follow at full speed [m/s]
     plan: GraspPlan = GraspPlan()  # of this grasp
     axis: AxisEstimate | None = None  # none before the first grasp
     u: np.ndarray = dc.field(default_factory=lambda: np.array([-1.0, 0.0, 0.0]))  # the valve's axis, towards the robot

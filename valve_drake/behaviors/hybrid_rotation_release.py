@@ -1,5 +1,7 @@
 """Stage 5, mode `release`: wrenches bled, fingers opened, hands drawn back."""
 
+import math
+
 import numpy as np
 
 from valve_drake.behaviors.closed_chain import (
@@ -16,6 +18,9 @@ from valve_drake.messages import (
     RobotState,
     Status,
 )
+
+BRISK = 0.7  # share of a joint's speed beyond which hands are drawn back more slowly; raise it if that takes too long
+EASE = 1.0  # until hands that start gently are drawn back at full speed [s]
 
 
 class Releasing(Hands):
@@ -41,10 +46,39 @@ class Releasing(Hands):
                 m = changed(m, stage="retreat", since=time, start=m.X, behind=self._behind(m, state.posture))
             return m, V, opened
         if m.stage == "retreat":
-            way = min(c.retreat, c.retreat_speed * (time - m.since))
-            left, right = (standoff(m.start[k], self.view[side], way) for k, side in enumerate(SIDES))
-            m = self._command(changed(m, back=way / c.retreat), (left, right), state.posture)
-            if way >= c.retreat:
+            m = self._draw_back(time, dt, m, state)
+            if m.back >= 1.0:
                 status = Status(time, m.activation, "succeeded", progress=1.0, value=m.plan.turned + m.turned)
                 m = changed(m, stage="away", status=status)
         return m, np.zeros((2, 6)), opened
+
+    def _draw_back(self, time: float, dt: float, m: Memory, state: RobotState) -> Memory:
+        """The next piece of the way back, as long as the joints can follow it.
+
+        A joint that is too slow for its command lags behind the others: the hand leaves its straight line, and the
+        fingers push the handle that is still between them. An elbow that is nearly straight is too slow for any hand.
+        """
+        c: HybridRotationConfig = self.config
+        way, done = c.retreat_speed * (time - m.since), c.retreat * m.back
+        after = self._drawn_back(m, way, state)
+        haste = self._haste(dt, m, after)
+        if haste <= 1 and m.pace == math.inf:
+            return after
+        pace = min(m.pace, c.retreat_speed if done else 0.0) + c.retreat_speed * dt / EASE
+        way = done + dt * min(pace, c.retreat_speed)
+        after = self._drawn_back(m, way, state)
+        if (haste := self._haste(dt, m, after)) > 1:
+            way = done + (way - done) / haste
+            after = self._drawn_back(m, way, state)
+        return changed(after, pace=(way - done) / dt, since=time - way / c.retreat_speed)
+
+    def _drawn_back(self, m: Memory, way: float, state: RobotState) -> Memory:
+        """Both hands `way` from where they let go [m]."""
+        way = min(way, self.config.retreat)
+        left, right = (standoff(m.start[k], self.view[side], way) for k, side in enumerate(SIDES))
+        return self._command(changed(m, back=way / self.config.retreat), (left, right), state.posture)
+
+    def _haste(self, dt: float, before: Memory, after: Memory) -> float:
+        """How fast the fastest joint has to be between two commands, as a share of what is allowed."""
+        allowed = [BRISK * dt * self.robot.arms[side].speed for side in SIDES]
+        return max(float(np.max(np.abs(after.q[k] - before.q[k]) / allowed[k])) for k in range(2))

@@ -6,8 +6,9 @@ is `document()`; a test keeps it current.
     idle -(open, close)-> search -> rough_approach -> fine_approach -> measure -> reach -> servo -> grasp -> turn
          -> release -> fold -> verify -> retreat -> done
 
-A turn that is longer than one grasp reaches goes back from verify to measure; so does fold if nothing is turned yet and
-the run is not failing. A retreat before the camera has decided goes back to verify.
+A turn that is longer than one grasp reaches goes back from verify to measure, and so does one that the camera sees
+elsewhere than the hands felt it; so does fold if nothing is turned yet and the run is not failing. A retreat before the
+camera has decided goes back to verify.
 """
 
 import dataclasses as dc
@@ -233,6 +234,7 @@ ROWS = (
         retry={
             Cause.REGRASP: Retry("regrasp", 12, Mode.MEASURE),
             Cause.UNSEEN: Retry("unseen", 1, Mode.RETREAT),  # and looks from there
+            Verdict.SLIP: Retry("short", 2, Mode.MEASURE),  # the rest is turned, wherever the angle was lost
         },
         off=Mode.RETREAT,
     ),
