@@ -275,6 +275,34 @@ def test_hands_never_hold_two_handles_of_which_one_is_before_the_other():
     assert held == {(0, 2), (2, 0), (1, 2), (2, 1)}
 
 
+def rim(count: int, radius: float) -> Valve:
+    angles = 2 * np.pi * np.arange(count) / count
+    handles = [HandleConfig(kind="rim", xyz=[radius * np.cos(a), radius * np.sin(a), 0]) for a in angles]
+    return dc.replace(VALVE, model="", handles=handles)
+
+
+@pytest.mark.parametrize("height, radius, turn", [(1.55, 0.34, 1.3), (0.6, 0.3, -1.7)])
+def test_a_wheel_too_high_or_too_low_for_hands_wide_apart_is_held_where_both_reach(height, radius, turn):
+    valve = rim(12, radius)
+    X_OA = compose(panel_pose(ValveConfig(height=height)), inverse(valve.X_AP()))
+    search = Stances(ROBOT, valve, CONFIG, VIEW, lambda *_: True)
+    margins = []
+    for groups in (slice(0, 1), slice(2, 3)):
+        turns = [Turn(compose(inverse(planar(-d, 0, 0)), X_OA), turn) for d in (0.70, 0.77, 0.84)]
+        some = [(at, pair) for at in turns for group in list(pairs(valve, at.X_BA, turn))[groups] for pair in group]
+        margins.append(max(search.check_arc(at, pair).margin for at, pair in some))
+    assert margins[0] < CONFIG.margin_min < CONFIG.margin_good < margins[1]
+
+
+@pytest.mark.parametrize("count, tried", [(2, 2), (3, 6), (5, 16), (12, 21)])
+def test_however_many_handles_there_are_few_pairs_are_tried_and_each_once(count, tried):
+    valve = rim(count, 0.15)
+    groups = list(pairs(valve, compose(inverse(planar(1.2, 0.4, 0.3)), valve_at(1.0)), 1.0))
+    assert [len(group) for group in groups[1::2]] == [3 * len(group) for group in groups[::2]]  # fingers otherwise
+    handles = [(pair["left"].handle, pair["right"].handle) for group in groups[::2] for pair in group]
+    assert len(set(handles)) == len(handles) == tried
+
+
 def test_a_robot_that_does_not_say_where_it_stands_tries_from_its_footprint_to_its_reach():
     pr2 = Robot.load(description.find("pr2/pr2.robot.yaml"))
     near, far = pr2.stand

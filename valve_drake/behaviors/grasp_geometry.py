@@ -18,7 +18,8 @@ from valve_drake.valve.valve import Valve, turned
 
 CROSSED = 0.02  # the left hand is to the right of the right one by more than this [m]
 APART = 0.03  # hands that are nearer across the axis leave open how the valve is turned [m]
-PAIRS = 6  # of handles, at most, that are tried of each kind
+WIDEST = 6  # pairs of handles of each kind, at most, that are tried first: those that are the widest apart
+OTHERS = 9  # pairs, at most, that are tried then, spread over all there are; raise it for wheels of more handles
 
 
 def standoff(X_AG: np.ndarray, view_G: np.ndarray, distance: float) -> np.ndarray:
@@ -84,8 +85,9 @@ class Free(Protocol):
 
 
 def pairs(valve: Valve, X_BA: np.ndarray, turn_angle: float) -> Iterator[tuple[Pair, ...]]:
-    """What both hands may hold, in groups that get worse: arms that do not cross, before those that do; fingers
-    with x_G to the robot's left, before the other way round."""
+    """What both hands may hold, in groups that get worse: arms that do not cross, the hands wide apart, then anywhere
+    (both at the bottom of a wheel that is high, for one), before those that cross; fingers with x_G to the robot's
+    left, before the other way round."""
     middle = turned(X_BA, turn_angle / 2)
     ahead = middle[:, :3] @ np.array([0.0, 0, 1])
     aside = np.array([-ahead[1], ahead[0]])  # to the robot's left, along the panel
@@ -97,12 +99,27 @@ def pairs(valve: Valve, X_BA: np.ndarray, turn_angle: float) -> Iterator[tuple[P
     sign = [1.0 if aside @ X[:2, 0] >= 0 else -1.0 for X in places]
     both = [(i, k) for i, k in itertools.permutations(count, 2) if math.dist(valve.radius(i), valve.radius(k)) >= APART]
     both.sort(key=lambda pair: at[pair[1]] - at[pair[0]])
-    plain = [pair for pair in both if at[pair[0]] - at[pair[1]] > -CROSSED][:PAIRS]
-    crossed = [pair for pair in both if pair not in plain][:PAIRS]
-    for some in (plain, crossed):
+    plain = [pair for pair in both if at[pair[0]] - at[pair[1]] > -CROSSED]
+    crossed = [pair for pair in both if pair not in plain][:WIDEST]
+    widest = plain[:WIDEST]
+    for some in (widest, _unlike(plain[WIDEST:], widest, [X[:, 3] for X in places]), crossed):
         for flips in (((1.0, 1.0),), ((-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))):
             yield tuple(
                 {LEFT: Grasp(i, sign[i] * flip[0]), RIGHT: Grasp(k, sign[k] * flip[1])}
                 for i, k in some
                 for flip in flips
             )
+
+
+def _unlike(
+    others: list[tuple[int, int]], tried: list[tuple[int, int]], places: list[np.ndarray]
+) -> list[tuple[int, int]]:
+    """Of the pairs of handles `others`, OTHERS at most: each the least like those before it, by both hands' places."""
+    at = {pair: np.concatenate([places[k] for k in pair]) for pair in (*others, *tried)}
+    near = {pair: min(math.dist(at[pair], at[other]) for other in tried) for pair in others}
+    chosen: list[tuple[int, int]] = []
+    while near and len(chosen) < OTHERS:
+        least = max(near, key=lambda pair: round(near[pair], 6))  # the first of those that are as unlike
+        chosen.append(least)
+        near = {pair: min(d, math.dist(at[pair], at[least])) for pair, d in near.items() if pair != least}
+    return chosen
