@@ -1,5 +1,6 @@
 """Do the arms touch anything? A model of robot, valve and panel for planning, apart from the simulated plant."""
 
+import itertools
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
@@ -18,14 +19,17 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from valve_drake.checks import ConfigError, shown
-from valve_drake.frames import compose
+from valve_drake.behaviors.grasp_geometry import APART
+from valve_drake.checks import ConfigError, require, shown
+from valve_drake.frames import compose, inverse, make
 from valve_drake.messages import SIDES
 from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
-from valve_drake.valve.valve import turned
+from valve_drake.valve.valve import Valve, turned
 
 FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the valve's pose while none is known
+
+ROOM = 0.3  # so much farther from the axis a hand is looked for that is clear of the valve, for the error's line [m]
 
 
 def stem_angle(X_BA: np.ndarray) -> float:
@@ -86,6 +90,10 @@ class CollisionModel:
         self._arms = robot.slots([name for side in SIDES for name in robot.arms[side].names])
         self._posture = robot.slots(robot.posture.names)
         self._rest = robot.rest(robot.opening if opening is None else opening)
+        self._home = robot.home
+        self._held = {side: robot.forward(side, robot.split(robot.home)[side]) for side in SIDES}
+        last = {side: self._plant.GetJointByName(robot.arms[side].names[-1], self._robot).index() for side in SIDES}
+        self._hands = {side: set(self._plant.GetBodiesKinematicallyAffectedBy([last[side]])) for side in SIDES}
         self.ignored: set[tuple[str, str]] = set()
         described = robot.description.collision
         if described.srdf:
@@ -148,6 +156,17 @@ class CollisionModel:
         pairs = self._near(X_BA, q, posture)
         return [f"{name(p.id_A)} - {name(p.id_B)}: {1e3 * p.distance:.0f} mm" for p in pairs]
 
+    def at_handle(self, side: str, X_AG: np.ndarray) -> list[str]:
+        """What of the valve that turns an open hand at X_AG touches, by shape; wherever arm and valve are."""
+        plant, inspector = self._plant, self._scene_graph.model_inspector()
+        wheel = plant.GetBodyByName("wheel", self._valve).index()
+        found = []
+        for pair in self._near(compose(self._held[side], inverse(X_AG)), self._home):
+            shapes = {plant.GetBodyFromFrameId(inspector.GetFrameId(s)).index(): s for s in (pair.id_A, pair.id_B)}
+            if wheel in shapes and self._hands[side] & shapes.keys():
+                found.append(inspector.GetName(shapes[wheel]).rpartition("::")[2])
+        return sorted(set(found))
+
     def _near(
         self, X_BA: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None
     ) -> list[SignedDistancePair]:
@@ -156,3 +175,45 @@ class CollisionModel:
             self._clearance
         )
         return pairs
+
+
+def check_handles(model: CollisionModel, valve: Valve) -> None:
+    """Raises ConfigError if there are no two handles that open hands can be at: they touch the valve at the others."""
+    count = range(len(valve.handles))
+    free = {side: [k for k in count if any(not model.at_handle(side, X) for X in _ways(valve, k))] for side in SIDES}
+    if any(math.dist(valve.radius(i), valve.radius(k)) >= APART for i, k in itertools.product(*free.values())):
+        return
+    handle, side = next((k, side) for side in SIDES for k in count if k not in free[side])
+    way = min(_ways(valve, handle), key=lambda X: len(model.at_handle(side, X)))
+    touched = set(model.at_handle(side, way))
+    words = f"an open hand there touches the valve ({', '.join(sorted(touched))}) or is nearer than collision.padding"
+    fixed = {name for name in touched if not name.startswith("spoke")}  # spokes reach as far as the rim, wherever it is
+    if not fixed:
+        rule = f"fewer, or farther from valve.handles[{handle}]: {words}"
+        raise ConfigError(f"valve.spokes must be {rule}, got {valve.spokes}")
+    extra = _room(model, side, way, fixed)
+    least = math.ceil(1e3 * (math.hypot(*valve.radius(handle)) + (extra or 0.0))) / 1e3
+    rule = "where a hand fits" if extra is None else f"at least {least:g} m off the axis"
+    require(False, f"valve.handles[{handle}].xyz", f"{rule}: {words}", valve.handles[handle].xyz)
+
+
+def _ways(valve: Valve, handle: int) -> list[np.ndarray]:
+    """The poses X_AG of a hand at a handle."""
+    return [valve.grasp(handle, sign) for sign in (1.0, -1.0)]
+
+
+def _room(model: CollisionModel, side: str, X_AG: np.ndarray, touched: set[str]) -> float | None:
+    """How much farther from the axis a hand is clear of these shapes, with the valve as it is [m]; None: nowhere."""
+    outwards = np.array([*X_AG[:2, 3], 0.0]) / math.hypot(*X_AG[:2, 3])
+
+    def touches(extra: float) -> bool:
+        there = make(X_AG[:, :3], X_AG[:, 3] + extra * outwards)
+        return not touched.isdisjoint(model.at_handle(side, there))
+
+    low, high = 0.0, ROOM
+    if touches(high):
+        return None
+    while high - low > 5e-4:
+        middle = (low + high) / 2
+        low, high = (middle, high) if touches(middle) else (low, middle)
+    return high

@@ -25,7 +25,7 @@ from valve_drake.behaviors.stance_search import Place, Stances
 from valve_drake.behaviors.taught import load_made_for, load_taught
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError
-from valve_drake.collision import CollisionModel
+from valve_drake.collision import CollisionModel, check_handles
 from valve_drake.config import Uniform
 from valve_drake.diagram import gaze_of, robot_of
 from valve_drake.frames import compose, inverse, planar
@@ -179,6 +179,10 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
     _base(report, robot)
     collision = CollisionModel(robot)
     _home(report, robot, collision)
+    try:
+        check_handles(collision, scenario.valve)
+    except ConfigError as error:
+        report.add(MISSING, "grasp", "", str(error))
     _servoing(report, robot, scenario)
     _grippers(report, robot, scenario)
     _servos(report, robot)
