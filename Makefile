@@ -1,16 +1,20 @@
-# `make run`: the whole work once; `make test`: the tests. Both set up what they need in .venv.
+# `make run`: the whole work once; `make test`: the tests that take a minute. Both set up what they need in .venv.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 
-.PHONY: run test slow robots lint format readers dask campaign draw clean
+.PHONY: run test system slow robots lint format readers dask campaign draw clean
 
 run: $(READY)
 	$(BIN)/valve-drake run $(ARGS)
 
 test: $(READY)
 	$(BIN)/python -m pytest -n auto --dist loadfile
+
+# The tests of the program at work: parts of runs, lessons, campaigns, twins, experiments.
+system: $(READY)
+	$(BIN)/python -m pytest -n auto --dist loadfile -m system
 
 slow: $(READY)
 	$(BIN)/python -m pytest -m slow

@@ -205,6 +205,7 @@ def assert_clear(run: Run, scene: Scene, start: np.ndarray) -> None:
 # ---------------------------------------------------------------- fine approach
 
 
+@pytest.mark.system
 def test_fine_approach_arrives_from_50_random_starts_within_30_s_and_off_the_panel():
     rng = np.random.default_rng(5)
     times = []
@@ -586,6 +587,7 @@ def test_block_refuses_a_wrong_message_and_needs_the_robot_state():
 # ---------------------------------------------------------------- other bases
 
 
+@pytest.mark.system
 def test_a_holonomic_base_arrives_from_50_random_starts_sooner_and_off_the_panel():
     rng = np.random.default_rng(5)
     times = []

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 FUNCTION = """
 import os, signal, sys
 import numpy as np
@@ -149,5 +151,6 @@ with physics.beside() as beside:
 """
 
 
+@pytest.mark.system
 def test_a_plant_beside_gives_the_bits_of_one_that_is_not_in_any_context():
     assert run(PLANT) == ["True", "True", "True"]

@@ -138,6 +138,7 @@ def test_names_that_tell_no_pairs_are_taken_in_order_and_said_so(tmp_path):
     assert [a.parent == b.parent for a, b in pair_images(left, right[1:] + right[:1]).paths] == [True] * 3
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("scale", [1, 2.2])
 @pytest.mark.parametrize("noise", [1.0, 4.0])
 def test_corners_of_a_large_noisy_image_are_found_in_a_reduced_one_and_refined_in_it(scale, noise, monkeypatch):
@@ -234,6 +235,7 @@ def test_paper_lens_with_unequal_factors_is_better_than_opencvs_and_chosen_as_be
     assert result.better == result.fit.kind == "paper" and result.other.rms > 1.02 * result.fit.rms
 
 
+@pytest.mark.system
 def test_standard_deviations_are_those_of_many_noisy_trials():
     poses, off = boards.tilted(6, np.random.default_rng(9)), []
     for seed in range(12):

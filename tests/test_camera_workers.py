@@ -60,6 +60,7 @@ def test_images_of_both_eyes_are_the_rigs_own_to_the_bit(rig, workers):
             np.testing.assert_array_equal(made.image, own.image)
 
 
+@pytest.mark.system
 def test_what_is_read_regularly_is_begun_at_its_capture_and_nothing_else(rig, workers):
     shots = captures(rig, 7)
     for capture in shots[:4]:
@@ -73,6 +74,7 @@ def test_what_is_read_regularly_is_begun_at_its_capture_and_nothing_else(rig, wo
     assert workers.frame("head_left", shots[6]).data == rig.frame("head_left", shots[6]).data  # not foreseen
 
 
+@pytest.mark.system
 def test_a_simulation_begun_anew_gets_its_own_images(rig, workers):
     first, second = captures(rig, 1)[0], captures(rig, 1, offset=0.2)[0]
     assert workers.frame("left_wrist", first).data == rig.frame("left_wrist", first).data
@@ -93,6 +95,7 @@ def test_the_processes_end_with_the_block_and_a_lost_one_is_named(rig, rig_argum
     gc.collect()  # what is left of a failed call must not take the program with it
 
 
+@pytest.mark.system
 def test_the_caller_decides_how_far_the_processes_stand_back(rig, rig_arguments):
     with CameraWorkers(*rig_arguments, niceness=7) as workers:
         workers.frame("head_left", captures(rig, 1)[0])
@@ -115,6 +118,7 @@ sys.stdout.buffer.write(pickle.dumps((kinds, data)))
 """
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("threads", [0, 1])
 def test_a_process_without_threads_is_forked_and_any_other_starts_new_ones(rig, rig_arguments, threads):
     capture = captures(rig, 1)[0]

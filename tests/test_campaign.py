@@ -61,7 +61,7 @@ def fake(tmp_path, monkeypatch):
     """The file of runs that were begun."""
     program = tmp_path / "fake.py"
     program.write_text(FAKE)
-    monkeypatch.setattr(trial, "PROGRAM", (sys.executable, str(program)))
+    monkeypatch.setattr(trial, "PROGRAM", (sys.executable, "-S", str(program)))
     monkeypatch.setenv("BEGUN", str(tmp_path / "begun"))
     return tmp_path / "begun"
 
@@ -191,12 +191,13 @@ KILLED = """
 import sys
 from pathlib import Path
 from valve_drake.campaign import campaign, executors, trial
-trial.PROGRAM = (sys.executable, {program!r})
+trial.PROGRAM = (sys.executable, "-S", {program!r})
 with executors.executor("local", 2) as pool:
     campaign.run(campaign.Campaign(("simulated.scenario.yaml",), 12, 1, (), Path({out!r})), pool)
 """
 
 
+@pytest.mark.system
 def test_killed_five_times_and_resumed_no_run_is_lost_or_counted_twice(tmp_path, fake, monkeypatch):
     monkeypatch.setenv("TAKES", "0.1")
     out = tmp_path / "out"
@@ -375,6 +376,7 @@ def test_a_trial_whose_log_another_run_still_writes_has_its_own_log(tmp_path, mo
     under_way.discard()
 
 
+@pytest.mark.system
 def test_the_runs_of_a_campaign_that_is_killed_die_with_it(tmp_path, fake, monkeypatch):
     monkeypatch.setenv("TAKES", "60")
     script = KILLED.format(program=str(tmp_path / "fake.py"), out=str(tmp_path / "out"))
@@ -432,6 +434,7 @@ def edge(tmp_path, monkeypatch):
     monkeypatch.setattr(trial, "PROGRAM", (sys.executable, "-S", str(program)))
 
 
+@pytest.mark.system
 def test_a_hunt_finds_the_corner_where_runs_fail(tmp_path, edge):
     records = run(wanted(tmp_path / "out", 48, hunt=True))
     failed = [k for k, record in enumerate(records) if not turned(record)]
@@ -442,6 +445,7 @@ def test_a_hunt_finds_the_corner_where_runs_fail(tmp_path, edge):
     assert f"simulation.valve.friction={draws['simulation.valve.friction']!r}" in records[failed[0]]["command"]
 
 
+@pytest.mark.system
 def test_a_hunt_that_is_broken_off_goes_on_as_it_would_have_gone(tmp_path, edge):
     whole = run(wanted(tmp_path / "whole", 20, hunt=True))
     run(wanted(tmp_path / "parts", 11, hunt=True))
@@ -486,6 +490,7 @@ def test_a_runs_margin_is_what_its_worst_figure_leaves(change, left):
     assert hunting.margin(record | change) == pytest.approx(left)
 
 
+@pytest.mark.system
 def test_failures_are_a_list_that_is_run_again(tmp_path, edge, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(["campaign", "--hunt", "--runs", "32", "--out", "hunt", "--jobs", "4", "--json"]) == 0
@@ -645,6 +650,7 @@ def test_the_command_prints_the_numbers_and_writes_page_and_table(tmp_path, fake
     assert cli.main(["runs", "out", "--json"]) == 0
 
 
+@pytest.mark.system
 def test_compare_pairs_the_seeds_of_two_campaigns(tmp_path, fake):
     run(wanted(tmp_path / "a", 10, 1))
     run(wanted(tmp_path / "b", 8, 5))

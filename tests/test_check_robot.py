@@ -35,6 +35,7 @@ def said(report, level):
     return [f"{finding.stage} {finding.key}: {finding.text}" for finding in report.findings if finding.level == level]
 
 
+@pytest.mark.system
 def test_our_robot_is_usable_and_its_table_is_that_of_the_stances(tmp_path, capsys):
     page = tmp_path / "ours.html"
     assert cli.main(["check-robot", "robot/robot.yaml", "--json", "--html", str(page)]) == 0
@@ -147,6 +148,7 @@ def test_what_a_robot_lacks_is_said_with_its_key(case, tmp_path, monkeypatch):
     assert all("\n" not in line for line in robot_check_page.lines(report))
 
 
+@pytest.mark.system
 def test_a_valve_out_of_reach_is_refused_and_one_of_several_is_doubtful(capsys):
     assert cli.main(["check-robot", "robot/robot.yaml", "--set", "simulation.valve.height=1.6"]) == 1
     lines = capsys.readouterr().out.splitlines()

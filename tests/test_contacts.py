@@ -77,6 +77,7 @@ def test_a_hand_that_slides_along_its_handle_slips(tmp_path):
     assert found.slips["left"] >= 1 and found.slips["right"] == 0
 
 
+@pytest.mark.system
 def test_a_grip_that_is_lost_in_mid_turn_counts_as_a_slip_and_ends_the_hold(tmp_path):
     hands = Hands(at_handle(LEFT), at_handle(RIGHT))
     hands.command(SHUT)
@@ -138,6 +139,7 @@ def test_a_hand_that_closes_on_nothing_collides_with_nothing(tmp_path):
     assert (found.collisions, found.peak_internal_force_N) == (0, 0.0)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", ["simulated.scenario.yaml", "pr2.scenario.yaml"])
 def test_any_robots_hands_hold_by_the_pads_that_its_file_names(name):
     scenario = scenarios.resolve(scenarios.load(name, ["seed=1", "simulation.start.at_valve=true"]))

@@ -82,6 +82,7 @@ def test_sizes_and_names_follow_the_drive(omni, bolted):
     assert vectors(ROBOT.groups)["base.odometry"] == 5
 
 
+@pytest.mark.system
 def test_a_holonomic_base_goes_sideways_and_its_odometry_agrees(omni):
     stood = Stood(scenario_of(omni, "simulation.start.distance=3", "simulation.start.bearing=0"))
     start = stood.read("truth.base_pose").copy()
@@ -97,6 +98,7 @@ def test_a_holonomic_base_goes_sideways_and_its_odometry_agrees(omni):
     assert stood.read("truth.base_pose") - start == pytest.approx(moved, abs=3e-3)
 
 
+@pytest.mark.system
 def test_a_holonomic_base_is_where_it_is_sent_while_it_turns(omni):
     stood = Stood(scenario_of(omni, "simulation.start.distance=3"))
     plant = stood.station.GetSubsystemByName("plant")
@@ -159,6 +161,7 @@ def test_a_base_command_on_the_wire_has_its_speeds_by_name():
     assert list(message.coord) == ["x", "y", "heading", "forward", "yaw_rate"]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("path", ["omni", "bolted"])
 def test_any_base_is_spoken_to_over_the_wire(path, request):
     scenario = scenario_of(request.getfixturevalue(path), "hardware.lcm_url='memq://'", "hardware.lockstep=true")

@@ -328,6 +328,7 @@ def red_pairs() -> list[list[np.ndarray]]:
     return [[np.ascontiguousarray(cv2.imread(name)[:, :, ::-1]) for name in pair] for pair in pairs]
 
 
+@pytest.mark.system
 def test_frontal_boards_calibrate_at_known_distances_only(red_head, tmp_path, capsys):
     assert red_head.rms_px == pytest.approx(1.35, abs=0.1)
     assert 1e3 * np.linalg.norm(red_head.X_LR[:, 3]) == pytest.approx(148.5, abs=1)
@@ -351,6 +352,7 @@ def edge_width(image: np.ndarray, corners: np.ndarray) -> float:
     return max(contrast / np.percentile(np.abs(np.diff(gray, axis=axis)), 99.5) for axis in (0, 1))
 
 
+@pytest.mark.system
 def test_red_square_is_found_and_has_one_size(red_head):
     pairs, sides, widths = red_pairs(), [], []
     for images in pairs:
@@ -383,6 +385,7 @@ def is_the_red_square(image: np.ndarray, corners: np.ndarray) -> bool:
     return inside[1] - ring[1] > 15 and inside[2] - ring[2] > 10
 
 
+@pytest.mark.system
 def test_side_does_not_follow_the_size_that_is_told(red_head):
     images = red_pairs()[1]
     told = np.array([0.92, 1.0, 1.08]) * SIDE
@@ -393,6 +396,7 @@ def test_side_does_not_follow_the_size_that_is_told(red_head):
     assert np.ptp(sides) < 0.15 * np.ptp(told)
 
 
+@pytest.mark.system
 def test_nothing_is_found_where_the_target_is_painted_over(red_head):
     for images in red_pairs()[::3]:
         seen = look(images, red_head, (SIDE, SIDE))

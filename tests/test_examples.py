@@ -68,6 +68,7 @@ def test_one_stage_finds_the_marker_in_a_diagram_of_its_own(pair, capsys, monkey
     assert np.allclose(seen, lens.project(X_LV[:2, 3] / X_LV[2, 3]), atol=3.0)  # [px]
 
 
+@pytest.mark.system
 def test_own_stage_adds_up_the_way_driven(capsys, monkeypatch):
     out = run(capsys, monkeypatch, "own_stage.py", "6")
     total, here = float(out.split(" m in ")[0]), float(out.split(", ")[1].split(" m")[0])

@@ -93,6 +93,7 @@ def test_tables_3_and_4_are_of_a_target_of_120_by_80_mm():
     assert np.abs(points - tables["table_4"]["proposed"]).max() < 0.15e-3
 
 
+@pytest.mark.system
 def test_fine_step_of_the_paper_has_its_known_bias_on_images_too():
     """equations.md: p_z is off by -0.83 ... -1.15 mm at the six printed T_c, without any noise."""
     eyes, off = mut.converged(0.32), []
@@ -110,6 +111,7 @@ def test_fine_step_of_the_paper_has_its_known_bias_on_images_too():
 # ---------------------------------------------------------------- experiments
 
 
+@pytest.mark.system
 def test_refined_reaches_a_tenth_of_the_printed_spread():
     rows = mut.table2(trials=1)["rows"]
     refined = [row for row in rows if row["method"] == "refined"]
@@ -117,6 +119,7 @@ def test_refined_reaches_a_tenth_of_the_printed_spread():
     assert not any(row["a tenth"] for row in rows[1:] if row["method"] == "paper")
 
 
+@pytest.mark.system
 def test_refined_is_steadier_than_stereo_vision_in_tables_3_and_4():
     rows = {(row["method"], row["noise"]): row for row in mut.table3(trials=5)["rows"]}
     for noise in mut.NOISES:
@@ -124,6 +127,7 @@ def test_refined_is_steadier_than_stereo_vision_in_tables_3_and_4():
         assert all(ours[name] < 0.5 * theirs[name] for name in ("rms deg", "P1 mm", "P2 mm", "P3 mm", "P4 mm"))
 
 
+@pytest.mark.system
 def test_refined_is_near_the_bound_and_its_covariance_honest():
     """At a large distance, where the corners' pixels are a large part of the information."""
     result = mut.bound(trials=20, distances=(2.5,), tilts=(30,))
@@ -143,6 +147,7 @@ def test_information_is_that_of_the_image():
     np.testing.assert_allclose(ratio, (4 + 1 / 12) / (16 + 1 / 12))
 
 
+@pytest.mark.system
 def test_robustness_finds_the_marker_and_nothing_else():
     result = mut.robustness(trials=2, empty=5)
     rows = {row["condition"]: row for row in result["rows"]}
@@ -152,6 +157,7 @@ def test_robustness_finds_the_marker_and_nothing_else():
     assert result["totals"]["wrong detections in them"] == 0
 
 
+@pytest.mark.system
 def test_same_seed_same_numbers_and_the_plot_is_written(tmp_path):
     a, b = (mut.bound(trials=4, distances=(1.8,), tilts=(30,)) for _ in range(2))
     assert json.dumps(a) == json.dumps(b)
@@ -160,6 +166,7 @@ def test_same_seed_same_numbers_and_the_plot_is_written(tmp_path):
     assert "<svg" in (tmp_path / "plot.svg").read_text()
 
 
+@pytest.mark.system
 def test_command(capsys, tmp_path):
     assert cli.main(["experiment", "table3", "--trials", "4", "--json", "--out", str(tmp_path)]) == 0
     assert json.loads(capsys.readouterr().out)["experiment"] == "table3"

@@ -195,6 +195,7 @@ def searched(dut: Stances, search):
     return search, portions
 
 
+@pytest.mark.system
 def test_a_place_that_took_long_to_find_is_tried_first_when_the_valve_is_measured_again():
     """Of a valve that lies flat, where no place is comfortable, the whole of the search is made but once."""
     dut = stances(distance_min=0.5, distance_max=0.54)
@@ -405,6 +406,7 @@ def test_places_between_are_tried_where_none_of_the_few_serves():
     assert margin >= CONFIG.margin_min and place.base.tolist() not in [p.base.tolist() for p in search.places[0]]
 
 
+@pytest.mark.system
 def test_grasps_that_do_not_follow_a_turn_to_its_end_turn_as_far_as_they_reach():
     X_OA = valve_at(1.0)
     place, _ = stances(distance_min=0.72, distance_max=0.76).find(X_OA, 1.5)

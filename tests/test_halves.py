@@ -57,12 +57,14 @@ def together(log):
     return replay(log, "alone")
 
 
+@pytest.mark.system
 def test_the_halves_find_what_all_blocks_together_find(log, together):
     halved, identical, topics = replay(log, "halves")
     assert halved and identical
     assert together == (False, True, topics) and len(topics) > 30
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("block", ["line_fitting", "base_approach"])
 def test_a_difference_in_either_half_is_found_and_told_by_all_blocks_together(log, together, block):
     halved, identical, topics = replay(log, block)

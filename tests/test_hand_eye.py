@@ -107,6 +107,7 @@ def test_position_error_of_the_arm_is_not_paid_in_rotation():
     assert max(off) < 0.3
 
 
+@pytest.mark.system
 def test_no_published_method_is_better_and_the_covariance_is_honest():
     rows = experiment.hand_eye(seed=0, trials=4, deg=(0.2,), mm=(0.0, 1.0))["rows"]
     assert len(rows) == 4

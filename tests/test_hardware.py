@@ -431,6 +431,7 @@ def test_a_finite_number_that_no_sensor_measures_is_as_good_as_none(puppet):
     np.testing.assert_array_equal(shown.values["torso.position_measured"], good.values["torso.position_measured"])
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seed", range(4))
 def test_whatever_is_sent_to_the_program_it_goes_on_and_recovers(seed):
     puppet = Puppet()

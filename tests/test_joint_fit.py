@@ -57,6 +57,7 @@ def test_sides_without_noise_are_true_to_two_thousandths(z, tilt):
     assert np.abs(distances(quad, X)).max() < 2e-3
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("z", [0.8, 2.5])
 def test_covariance_is_honest_and_less_than_that_of_sides_alone(z):
     X, rng, values, gain = pose(z, 0.6), np.random.default_rng(1), [], []

@@ -28,6 +28,7 @@ def test_all_levels_are_there():
     assert all(scenarios.load(name) for name in LEVELS)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", WORK)
 def test_a_level_has_a_stance_from_which_its_turn_is_made_and_its_valve_turns_as_far(name):
     scenario = scenarios.resolve(scenarios.load(name, ["seed=2"]))

@@ -168,6 +168,7 @@ def test_without_the_extra_run_live_says_in_one_line_what_to_install(monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.system
 def test_a_run_is_served_while_it_goes_on_and_its_log_is_the_same_to_the_byte(tmp_path):
     pytest.importorskip("foxglove", reason="the live extra is not installed")
     from valve_drake import runner

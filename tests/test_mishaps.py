@@ -106,6 +106,7 @@ def test_the_cameras_see_nothing_while_the_lamps_are_out():
 PUSHED, COVERED = "simulation.valve.pushed", "simulation.valve.covered"
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("by", [0.1, -0.06])
 def test_a_valves_stand_is_pushed_aside_once_a_hand_is_near_and_stays_there(by):
     rig = Rig([f"{PUSHED}_at=2.0", f"{PUSHED}_by={by}", "simulation.valve.yaw=0.0"])
@@ -137,6 +138,7 @@ def test_a_rail_waits_then_goes_stays_on_its_way_and_goes_on():
     assert rail.desired(q, 1.0, step) == (-0.3, 0.0)
 
 
+@pytest.mark.system
 def test_a_cover_hides_half_of_the_marker_for_its_time():
     rig = Rig([f"{COVERED}_at=4.0", f"{COVERED}_for=1.0", "simulation.start.distance=3.0", "simulation.valve.yaw=0.0"])
 

@@ -305,6 +305,7 @@ def test_only_a_desk_with_the_key_is_heard_and_nothing_that_was_said_before(tmp_
     assert pair.program.dropped == {WORDS: 1}
 
 
+@pytest.mark.system
 def test_whatever_comes_on_the_channels_both_sides_go_on_and_count_it():
     rng = np.random.default_rng(8)
     pair = Pair().run()

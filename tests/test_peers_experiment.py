@@ -83,6 +83,7 @@ def test_poses_of_other_libraries_are_in_our_axes(name):
     assert min(np.linalg.norm(experiments.pose_error(one, X)) for one, _ in own) < 0.01
 
 
+@pytest.mark.system
 def test_experiment_says_what_is_not_installed_and_measures_the_rest(monkeypatch):
     monkeypatch.setattr(mut.importlib.util, "find_spec", lambda name: None)
     result = mut.peers(trials=4, distances=(2.0,))

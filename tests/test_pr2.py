@@ -34,6 +34,7 @@ def test_the_wiring_is_the_reviewed_one(scenario):
     assert drawing.svg(system) == (resources.diagrams() / "pr2.svg").read_text()
 
 
+@pytest.mark.system
 def test_it_finds_the_valve_within_a_second_and_the_log_has_its_own_joints(tmp_path, scenario):
     result = runner.run(scenario, tmp_path / "pr2.mcap", duration=1.0)
     assert [span.mode for span in result.summary.spans] == [Mode.IDLE, Mode.SEARCH, Mode.ROUGH_APPROACH]
@@ -83,6 +84,7 @@ def _actuators(plant, robot, side):
     return [by_joint[name] for name in robot.arms[side].names]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("limit", [30.0, 60.0])
 def test_its_fingers_shut_and_press_with_the_force_limit(scenario, limit):
     """The joint turns: the limit reaches it by the lever, and comes back as what the actuator pushes with."""

@@ -78,6 +78,7 @@ def cramer_rao(X, sigma, cameras):
     return np.linalg.inv(J.T @ J)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("cameras", ["left", "both"])
 @pytest.mark.parametrize("k", range(3))
 def test_refined_reaches_the_cramer_rao_bound_and_says_so(cameras, k):

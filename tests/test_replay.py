@@ -210,6 +210,7 @@ def test_another_image_threshold_is_found_in_the_first_image(path, log, capsys):
     assert all(replayed == equal for replayed, equal in images)
 
 
+@pytest.mark.system
 def test_the_replays_own_log_is_the_same_without_the_truth_and_can_be_replayed(path, log, tmp_path, capsys):
     copy = tmp_path / "copy.mcap"
     assert cli.main(["replay", str(path), "--log", str(copy), "--json"]) == 0
@@ -220,6 +221,7 @@ def test_the_replays_own_log_is_the_same_without_the_truth_and_can_be_replayed(p
     assert runner.replay(again).comparison.identical
 
 
+@pytest.mark.system
 def test_a_log_replays_with_its_own_files_and_set_names_others(path, log, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert log.attachments["head_calibration.yaml"].data == (resources.models() / HEAD).read_bytes()
@@ -247,6 +249,7 @@ def test_a_log_without_its_files_is_replayed_with_those_of_today_and_says_so(log
     assert f"the log does not hold its taught: {TAUGHT} of today stands in" in result.notes
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", ["cut off", "flipped"])
 def test_a_damaged_log_is_replayed_up_to_the_damage(kind, path, tmp_path, capsys):
     data, bad = path.read_bytes(), tmp_path / "bad.mcap"
@@ -264,6 +267,7 @@ def test_a_damaged_log_is_replayed_up_to_the_damage(kind, path, tmp_path, capsys
     assert saved.comparison.identical and saved.end == result["replayed_s"]
 
 
+@pytest.mark.system
 def test_a_paced_robots_log_is_identical_though_the_walls_clock_does_not_come_again(log, tmp_path):
     pace = PACE, Pace(1.5, 192, 1, 0.01, 0.002, 0.006, 0.02), 1.5
     paced = rewritten(log, tmp_path / "a.mcap", lambda topic: not topic.startswith("/truth/"), 1.5, also=[pace])
@@ -271,6 +275,7 @@ def test_a_paced_robots_log_is_identical_though_the_walls_clock_does_not_come_ag
     assert comparison.identical and PACE not in comparison.topics and len(comparison.topics) > 30
 
 
+@pytest.mark.system
 def test_a_robots_log_has_no_truth_and_is_replayed_and_reviewed_as_any(path, log, tmp_path, capsys):
     scenario = log.metadata["run"]["scenario"].replace("station: simulated", "station: hardware")
     robots = rewritten(
@@ -464,6 +469,7 @@ def test_differences_name_the_field_and_see_single_bits():
     assert [d[0] for d in differences(foxglove.log(1.0, "x", ""), foxglove.log(1.5, "x", ""))] == ["timestamp.nanos"]
 
 
+@pytest.mark.system
 def test_a_simulator_on_the_recorded_station_comes_to_the_same_bits(log, recording):
     scenario, _ = runner._recorded_scenario(log)
     with runner._files_of(log, scenarios.with_overrides(dc.replace(scenario, station="replay"), []), []) as files:

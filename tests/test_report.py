@@ -367,6 +367,7 @@ def browse(page, tmp_path):
     return json.loads(html.unescape(probe.group(1))), console
 
 
+@pytest.mark.system
 @pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
 @pytest.mark.parametrize("which", ["one", "two"])
 def test_a_browser_shows_it_without_error_and_asks_for_nothing(which, page, review, other, folder, tmp_path):
@@ -382,6 +383,7 @@ def test_a_browser_shows_it_without_error_and_asks_for_nothing(which, page, revi
     assert probe["zoomed"] and probe["back"] and probe["wide"]
 
 
+@pytest.mark.system
 @pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
 def test_the_browser_would_tell_of_a_request_that_leaves_the_page(page, tmp_path):
     probe, console = browse(page.replace("<body>", '<body><img src="http://example.test/a.png">', 1), tmp_path)

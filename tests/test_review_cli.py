@@ -177,6 +177,7 @@ def test_export_npz_gives_arrays_by_field(log, capsys, tmp_path):
         assert found["angle"][-1] == sample.valve_angle(5.0)
 
 
+@pytest.mark.system
 def test_every_topic_can_be_exported_in_both_forms(log, tmp_path):
     reader = LogReader(log)
     for topic in reader.topics:

@@ -68,12 +68,14 @@ def test_the_layout_names_only_topics_of_the_log(short):
             assert path_.split(".")[0] in set(reader.topics) | late
 
 
+@pytest.mark.system
 def test_same_seed_same_file_to_the_last_byte(short, tmp_path):
     _, path = short
     run(tmp_path / "again.mcap", ["seed=4"], duration=3.0)
     assert sha(tmp_path / "again.mcap") == sha(path)
 
 
+@pytest.mark.system
 def test_another_seed_is_another_file(short, tmp_path):
     _, path = short
     run(tmp_path / "other.mcap", ["seed=5"], duration=0.5)
@@ -84,6 +86,7 @@ def messages(path):
     return [r for r in LogReader(path).records() if not r.topic.startswith("/truth/")]
 
 
+@pytest.mark.system
 def test_without_the_truth_ports_every_other_message_is_the_same_to_the_byte(short, tmp_path):
     _, path = short
     run(tmp_path / "blind.mcap", ["seed=4"], duration=3.0, truth=False)
@@ -92,6 +95,7 @@ def test_without_the_truth_ports_every_other_message_is_the_same_to_the_byte(sho
     assert messages(tmp_path / "blind.mcap") == messages(path)
 
 
+@pytest.mark.system
 def test_an_operators_stop_ends_the_run_still_and_stopped(tmp_path):
     calls = []
     result = run(tmp_path / "stop.mcap", ["seed=4"], stop=lambda: len(calls) > 40, show=calls.append)
@@ -122,6 +126,7 @@ def full_disk(monkeypatch):
     monkeypatch.setattr("os.fsync", full)
 
 
+@pytest.mark.system
 def test_a_full_disk_stops_the_log_and_not_the_run(tmp_path, monkeypatch):
     full_disk(monkeypatch)
     said = []
@@ -131,6 +136,7 @@ def test_a_full_disk_stops_the_log_and_not_the_run(tmp_path, monkeypatch):
     assert result.summary.sim_time_s == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.system
 def test_a_full_disk_is_said_in_one_line_and_the_verdict_is_shown(here, capsys, monkeypatch):
     full_disk(monkeypatch)
     code, out, err = command(capsys, "--duration", "0.01", "--log", "full.mcap")
@@ -138,6 +144,7 @@ def test_a_full_disk_is_said_in_one_line_and_the_verdict_is_shown(here, capsys, 
     assert err.count("\n") == 1 and err.startswith("valve-drake: logging stopped: No space left on device; ")
 
 
+@pytest.mark.system
 def test_a_log_folder_that_is_moved_in_mid_run_keeps_the_log_and_the_verdict(tmp_path):
     def move(progress):
         if progress.sim_time == 0.0:
@@ -149,6 +156,7 @@ def test_a_log_folder_that_is_moved_in_mid_run_keeps_the_log_and_the_verdict(tmp
     assert LogReader(result.log).metadata["result"]["outcome"] == "unfinished"
 
 
+@pytest.mark.system
 def test_a_rendering_process_that_is_killed_ends_the_run_with_a_verdict_and_a_whole_log(here, capsys, monkeypatch):
     enter = runner.CameraWorkers.__enter__
 
@@ -167,6 +175,7 @@ def test_a_rendering_process_that_is_killed_ends_the_run_with_a_verdict_and_a_wh
     assert log.damage == [] and log.metadata["result"]["verdict"] == "fault"
 
 
+@pytest.mark.system
 def test_a_second_run_of_one_seed_takes_the_next_name_and_says_so(here, capsys):
     for name in ("run-4.mcap", "run-4-2.mcap"):
         code, out, err = command(capsys, "--seed", "4", "--duration", "0.01", "--json")
@@ -177,6 +186,7 @@ def test_a_second_run_of_one_seed_takes_the_next_name_and_says_so(here, capsys):
     assert {path.name for path in (here / "logs").iterdir()} == names
 
 
+@pytest.mark.system
 def test_a_log_that_was_named_and_exists_is_replaced_with_overwrite_only(here, capsys):
     (here / "a.mcap").write_text("mine")
     code, _, err = command(capsys, "--duration", "0.01", "--log", "a.mcap")
@@ -185,6 +195,7 @@ def test_a_log_that_was_named_and_exists_is_replaced_with_overwrite_only(here, c
     assert code == 0 and err == "" and LogReader("a.mcap").damage == []
 
 
+@pytest.mark.system
 def test_a_log_takes_the_place_of_an_empty_file_and_follows_a_link(here, capsys):
     (here / "there").mkdir()
     (here / "there" / "empty.mcap").touch()
@@ -228,6 +239,7 @@ def test_a_refused_run_leaves_no_file_and_touches_none(here, capsys, refusal, mo
     assert (here / "logs" / "run-0.mcap").read_text() == "older"
 
 
+@pytest.mark.system
 def test_a_signal_is_the_operators_stop_and_the_log_is_whole(here, capsys, monkeypatch):
     advance = runner._advance
 
@@ -247,6 +259,7 @@ def test_a_signal_is_the_operators_stop_and_the_log_is_whole(here, capsys, monke
     assert log.damage == [] and log.metadata["result"]["outcome"] == "stopped"
 
 
+@pytest.mark.system
 def test_a_run_that_fails_within_its_duration_exits_1(here, capsys, monkeypatch):
     ended = ModeState(mode=Mode.FAILED, verdict="timeout", reason="too long")
     monkeypatch.setattr(runner, "_advance", lambda *_: ended)
@@ -254,6 +267,7 @@ def test_a_run_that_fails_within_its_duration_exits_1(here, capsys, monkeypatch)
     assert code == 1 and "failed  verdict timeout  too long" in out
 
 
+@pytest.mark.system
 def test_a_name_that_is_not_utf8_is_written_and_shown(here, capsys):
     name = os.fsdecode(b"caf\xe9.mcap")
     code, out, err = command(capsys, "--duration", "0.01", "--log", name)
@@ -261,11 +275,13 @@ def test_a_name_that_is_not_utf8_is_written_and_shown(here, capsys):
     assert json.loads((here / name).with_suffix(".json").read_text())["log"] == name
 
 
+@pytest.mark.system
 def test_brackets_in_a_name_are_no_markup(here, capsys):
     code, out, _ = command(capsys, "--duration", "0.01", "--log", "z[/b].mcap")
     assert code == 0 and "log z[/b].mcap" in out
 
 
+@pytest.mark.system
 def test_the_3d_view_takes_the_next_free_port_and_says_which(here, capsys):
     with socket.socket() as taken:
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -166,6 +166,7 @@ def test_the_base_drives_like_a_differential_drive_and_odometry_agrees_without_e
     np.testing.assert_allclose(rig.read("truth.base_pose"), [-3 + x, y, heading], atol=2e-3)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("scale, seed, drift", [(0.0, 2, 1.0), (0.05, 2, 0.983), (0.1, 2, 0.966), (0.05, 3, 1.009)])
 def test_odometry_drifts_by_a_share_of_the_way_that_the_seed_draws(scale, seed, drift):
     settings = [f"simulation.error.odometry_scale={scale}", "simulation.start.distance=3", f"seed={seed}"]
@@ -244,8 +245,8 @@ def test_a_head_with_opencv_lenses_renders_what_the_same_head_with_the_papers_le
 
 def test_a_camera_that_nobody_reads_is_not_rendered_and_a_late_reader_sees_the_capture(monkeypatch):
     count = []
-    real = simulated.CameraRig.frame
-    monkeypatch.setattr(simulated.CameraRig, "frame", lambda *a: (count.append(a[1]), real(*a))[1])
+    real = camera_rig.CameraRig.frame
+    monkeypatch.setattr(camera_rig.CameraRig, "frame", lambda *a: (count.append(a[1]), real(*a))[1])
     rig = Rig().run(0.3)
     assert count == []
     frame = rig.read("head_left.image")
@@ -253,6 +254,7 @@ def test_a_camera_that_nobody_reads_is_not_rendered_and_a_late_reader_sees_the_c
     assert rig.read("head_left.image") is frame and count == ["head_left"]
 
 
+@pytest.mark.system
 def test_same_seed_same_image_other_seed_other_noise():
     noisy = ["simulation.camera.noise=2"]
     a, b, c = (Rig([*noisy, f"seed={s}"]).run(0.07).read("head_left.image") for s in (1, 1, 2))

@@ -30,6 +30,7 @@ def taught():
         patch.undo()
 
 
+@pytest.mark.system
 def test_the_shipped_references_are_current(taught):
     shipped = load_taught(SHIPPED)
     for side in SIDES:
@@ -40,12 +41,14 @@ def test_the_shipped_references_are_current(taught):
     assert teaching.made_for(robot_of(scenario), scenario.valve) == load_made_for(SHIPPED)
 
 
+@pytest.mark.system
 def test_the_view_direction_learned_from_images_is_the_cameras(taught):
     for side, sign in zip(SIDES, (-1.0, 1.0)):
         true = np.array([sign * 0.075, 0.0, 0.13])  # from the camera to the grip point, models/robot/robot.sdf
         assert np.degrees(np.arccos(taught[side].view @ true / np.linalg.norm(true))) < 5.0
 
 
+@pytest.mark.system
 def test_the_lesson_over_the_wire_is_the_same_but_for_the_encoders_errors(taught, monkeypatch):
     """The twin's hands are on the handles within a few millimeters, as an operator would put them."""
     monkeypatch.setattr(teaching, "IMAGES", 2)
@@ -60,12 +63,14 @@ def test_the_lesson_over_the_wire_is_the_same_but_for_the_encoders_errors(taught
         assert pictures[side].shape == (480, 640, 3)
 
 
+@pytest.mark.system
 def test_a_mark_out_of_sight_is_one_clear_line():
     scenario = scenarios.load(None, ["handle_marker.segmentation.min_area=200000"])
     with pytest.raises(ConfigError, match="no mark in 8 of 8 left wrist images"):
         teaching.teach(scenario)
 
 
+@pytest.mark.system
 def test_noise_that_hides_the_mark_in_some_images_does_not_end_it(monkeypatch):
     find, count = teaching.find_mark, iter(range(10**6))
 
@@ -80,6 +85,7 @@ def test_noise_that_hides_the_mark_in_some_images_does_not_end_it(monkeypatch):
         teaching.teach(scenarios.load(None))
 
 
+@pytest.mark.system
 def test_a_contact_a_fault_and_the_operator_end_the_lesson(monkeypatch):
     with pytest.raises(OperationFailed, match="stopped by the operator"):
         teaching.teach(scenarios.load(), stop=lambda: True)
@@ -107,9 +113,9 @@ def test_a_robot_that_does_not_reach_is_one_clear_line(tmp_path):
 
 
 @pytest.fixture
-def lessons(taught, monkeypatch, tmp_path):
-    """The lessons that were given; they cost nothing. The cache is empty."""
-    given = []
+def lessons(monkeypatch, tmp_path):
+    """The lessons that were given; they cost nothing, and teach what is shipped. The cache is empty."""
+    given, taught = [], load_taught(SHIPPED)
 
     def teach(scenario, stop=None, link=None):
         given.append(scenario)
@@ -159,13 +165,13 @@ def test_a_real_robot_with_references_of_another_is_refused_with_what_to_do(case
     assert not lessons and "\n" not in line
 
 
-def test_the_shipped_references_need_no_lesson_and_old_ones_do(lessons, taught, tmp_path):
+def test_the_shipped_references_need_no_lesson_and_old_ones_do(lessons, tmp_path):
     scenario = scenarios.resolve(scenarios.load())
     assert teaching.prepared(scenario) is scenario and not lessons
     longer = variant(tmp_path / "robot", lambda m: put(part(m, "link", "left_forearm"), "pose", "0.4 0 0 0 0 0"))
     robot = scenarios.resolve(scenarios.load(None, [f"robot={longer}"]))
     assert teaching.prepared(robot) is robot  # longer arms: the images at the handles are the same
-    save_taught(taught, tmp_path / "old.yaml", "without made_for")
+    save_taught(load_taught(SHIPPED), tmp_path / "old.yaml", "without made_for")
     said = []
     teaching.prepared(dc.replace(scenario, taught=str(tmp_path / "old.yaml")), said.append)
     assert "old.yaml is of a robot, marker and opening that it does not name" in said[0] and len(lessons) == 1

@@ -134,6 +134,7 @@ def test_the_station_computes_the_wrench_on_the_port_of_the_sensor_that_there_is
     assert set(ROBOT.groups.absent) == set()
 
 
+@pytest.mark.system
 def test_over_the_wire_the_same_wrench_comes_of_what_the_joints_report(tmp_path):
     path = variant(tmp_path, change=without_force_sensors)
     settings = [f"robot={path}", "hardware.lcm_url='memq://'", "hardware.lockstep=true"]

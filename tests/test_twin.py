@@ -299,6 +299,7 @@ def short(tmp_path_factory):
         return result, path, twin
 
 
+@pytest.mark.system
 def test_the_program_drives_the_twin_through_lcm(short):
     result, path, twin = short
     assert result.summary.spans[1].mode == Mode.SEARCH and twin.tick == 128
@@ -309,6 +310,7 @@ def test_the_program_drives_the_twin_through_lcm(short):
     assert abs(neck["neck_yaw"]) > 0.01 or abs(neck["neck_pitch"]) > 0.01, "the gaze has moved"
 
 
+@pytest.mark.system
 def test_no_command_waits_for_an_image(monkeypatch):
     done = []
     send, look = RobotLink.send, ColorSegmentationSystem.step
@@ -326,6 +328,7 @@ def test_no_command_waits_for_an_image(monkeypatch):
         assert done == ["send", "send", "look"]
 
 
+@pytest.mark.system
 def test_in_lock_step_all_devices_are_fresh_and_nothing_is_refused(short):
     log = LogReader(short[1])
     health = [log.decode(record) for record in log.records(["/health"])]
@@ -334,6 +337,7 @@ def test_in_lock_step_all_devices_are_fresh_and_nothing_is_refused(short):
     assert max(np.max(h.ages[: len(REPORTS)]) for h in health) == 0
 
 
+@pytest.mark.system
 def test_the_same_seed_gives_the_same_log_to_the_byte(short, tmp_path):
     _, path, _ = short
     scenario = near()
@@ -342,6 +346,7 @@ def test_the_same_seed_gives_the_same_log_to_the_byte(short, tmp_path):
     assert (tmp_path / "again.mcap").read_bytes() == path.read_bytes()
 
 
+@pytest.mark.system
 def test_a_twin_that_lives_by_the_clock_sends_the_images_that_are_asked_for_and_no_others():
     scenario = scenarios.resolve(near("hardware.lockstep=false"))
     lcm, seen = DrakeLcm("memq://"), []
@@ -565,6 +570,7 @@ def test_another_robot_on_the_bus_is_reported(commanded):
     c.twin._bus.senders = Senders()
 
 
+@pytest.mark.system
 def test_whatever_is_sent_to_the_twin_it_goes_on_and_obeys_again(commanded):
     c = commanded
     for k, message in enumerate(bad_messages(np.random.default_rng(5), CONTROLLER, 1500)):
@@ -617,6 +623,7 @@ def test_first_images_that_take_long_are_told_and_can_be_stopped(monkeypatch):
     assert told == ["the twin waits for its renderers: no image yet of head_left, head_right, left_wrist, right_wrist"]
 
 
+@pytest.mark.system
 def test_a_hardware_log_replays_to_the_bit(short):
     result = runner.replay(LogReader(short[1]))
     assert result.comparison.identical, result.comparison.first

@@ -1,6 +1,9 @@
 """Poses of all bodies of robot and valve, computed from measurements and estimates, for the log's 3D view."""
 
+import functools
+
 import numpy as np
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from valve_drake.camera.lens import StereoHead
 from valve_drake.frames import compose, planar
@@ -34,7 +37,7 @@ class RobotFrames:
         self._valve = valve = shared.shape
         self._X_VA, self._X_AV, self._X_AP = valve.X_VA(), valve.X_AV(), valve.X_AP()
         self._X_VWheel = compose(self._X_VA, self._X_AP)
-        self.scene = scene(parts_of(shared.scene_graph.model_inspector()))
+        self.scene = _scene(robot)
         self._slots = {
             "base": [self._slot(n) for n in robot.base.names],
             "torso": [self._slot(n) for n in robot.torso.names],
@@ -79,6 +82,12 @@ class RobotFrames:
             ("marker", "valve::wheel", self._X_VWheel),
             (ODOMETRY, "valve::panel", compose(X_OA, self._X_AP)),
         ]
+
+
+@functools.lru_cache(maxsize=4)
+def _scene(robot: Robot) -> SceneUpdate:
+    """The looks of a robot and its valve; nobody changes them, and a robot is made once."""
+    return scene(parts_of(robot.model.scene_graph.model_inspector()))
 
 
 def pinholes(head: StereoHead) -> dict[str, tuple[tuple[int, int], np.ndarray]]:

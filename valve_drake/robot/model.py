@@ -57,9 +57,8 @@ def parse(
     parser = Parser(plant)
     known = parser.package_map()
     known.AddPackageXml(str(resources.models() / "package.xml"))
-    for name, folder in packages.named_in(path):
-        if not known.Contains(name):
-            known.Add(name, str(folder))
+    for name, folder in packages.named_in(path, known.Contains):
+        known.Add(name, str(folder))
     try:
         models: list[ModelInstanceIndex]
         if colors:

@@ -9,7 +9,7 @@ import itertools
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -70,13 +70,14 @@ def packages(name: str, beside: Path | None) -> Iterator[Path]:
             yield folder
 
 
-def named_in(path: Path) -> Iterator[tuple[str, Path]]:
-    """The packages whose files a model file names, and where they are; without those that are nowhere."""
+def named_in(path: Path, known: Callable[[str], bool] = lambda name: False) -> Iterator[tuple[str, Path]]:
+    """The packages whose files a model file names, and where they are; without those that are nowhere, and without
+    the known ones, which need not be looked for."""
     found = set()
     for match in _URL.finditer(path.read_bytes()):
         url = match[0].decode("utf-8", "replace")
         name, _, inside = unquote(url.partition("://")[2]).lstrip("/").partition("/")
-        if name not in found:
+        if name not in found and not known(name):
             folder = next((f for f in packages(name, path.parent) if _is_file(f / inside)), None)
             if folder is not None:
                 found.add(name)

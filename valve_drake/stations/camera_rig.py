@@ -258,13 +258,33 @@ class CameraRig:
         return np.ascontiguousarray(self._render(self.plant.world_frame(), X_WC, info)[..., :3])
 
 
+class RigWhenRead:
+    """A CameraRig that is made when the first image is read: a station at whose images nobody looks has none."""
+
+    def __init__(self, *arguments: Any):
+        self._arguments = arguments
+
+    @functools.cached_property
+    def _rig(self) -> CameraRig:
+        return CameraRig(*self._arguments)
+
+    def captured(self, name: str, capture: "Capture") -> None:
+        """Does nothing, as the rig's own."""
+
+    def frame(self, name: str, capture: "Capture") -> CameraFrame:
+        return self._rig.frame(name, capture)
+
+
+@functools.lru_cache(maxsize=1)
 def _noise_pool(seed: int, deviation: float) -> np.ndarray:
     """White noise in grey levels (int16), more than one image needs: every image uses a stretch from a random place.
 
     A million new random numbers for each image would take as long as its rendering.
     """
     noise = np.random.Generator(np.random.SFC64([seed, 99])).standard_normal(4 << 20, dtype=np.float32)
-    return np.rint(deviation * noise).astype(np.int16)
+    pool = np.rint(deviation * noise).astype(np.int16)
+    pool.setflags(write=False)  # it is shared
+    return pool
 
 
 def encode_frame(camera: str, time: float, sequence: int, image: np.ndarray, quality: int) -> CameraFrame:

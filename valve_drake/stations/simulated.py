@@ -31,7 +31,7 @@ from valve_drake.robot.description import ArmDescription, RobotDescription
 from valve_drake.robot.drive import DIFFERENTIAL, Drive, whole
 from valve_drake.robot.groups import POSE
 from valve_drake.robot.robot import Robot
-from valve_drake.stations.camera_rig import CameraRig, CameraSystem, Mount
+from valve_drake.stations.camera_rig import CameraSystem, Images, Mount, RigWhenRead
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.contract import CAMERAS, TRUTH, WRISTS, check_contract
 from valve_drake.stations.mishaps import LostGripSystem, WheelSlipSystem, slips
@@ -440,9 +440,7 @@ def make_simulated_station(
 
     camera = simulation.camera
     place = physics.place
-    images: Any = workers
-    if images is None:
-        images = CameraRig(*rig_arguments(simulation, shape, head, seed, robot.description, place))
+    images: Images = workers or RigWhenRead(*rig_arguments(simulation, shape, head, seed, robot.description, place))
     missing = [name for name in WRISTS if not robot.description.cameras[name]]
     for name in missing:  # its port never shows an image
         nothing = builder.AddNamedSystem(name, ConstantValueSource(Value(CameraFrame(camera=name))))
