@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
+# Byte code is kept, whatever the user's shell says, and beside no source: tests start Pythons by the dozen.
+export PYTHONPYCACHEPREFIX = $(abspath $(VENV))/byte_code
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run test system slow robots lint format readers dask campaign draw clean
 

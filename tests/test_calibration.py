@@ -156,6 +156,7 @@ def test_corners_of_a_large_noisy_image_are_found_in_a_reduced_one_and_refined_i
     assert np.sqrt((error**2).sum(1).mean()) < 0.1 and max(searched) == 1300
 
 
+@pytest.mark.system
 def test_pure_noise_is_given_up_without_the_search_that_takes_minutes(monkeypatch):
     quick, find = [], cv2.findChessboardCorners
     monkeypatch.setattr(
@@ -281,6 +282,7 @@ def test_a_symmetric_board_is_numbered_alike_in_both_images(shape):
         np.testing.assert_array_equal(view.px[1], true.px[1])
 
 
+@pytest.mark.system
 def test_pairs_of_other_moments_are_said_to_be_no_pairs_and_not_a_vague_focal_length():
     seen = views((PAPER, PAPER), boards.tilted(5, np.random.default_rng(43), 0.45), 0.1, 44)
     others = [dc.replace(view, px=(view.px[0], seen[k - 1].px[1])) for k, view in enumerate(seen)]

@@ -49,6 +49,7 @@ def captures(rig, count, offset=0.0):
     return out
 
 
+@pytest.mark.system
 def test_images_of_both_eyes_are_the_rigs_own_to_the_bit(rig, workers):
     for capture in captures(rig, 3):
         for name in ("head_left", "head_right"):

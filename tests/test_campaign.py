@@ -175,6 +175,7 @@ def test_a_trial_finds_its_files_from_wherever_it_is_run(tmp_path, fake, monkeyp
     assert turned(perform(one))
 
 
+@pytest.mark.system
 def test_records_are_equal_but_for_their_times(tmp_path, fake):
     a, b = run(wanted(tmp_path / "a")), run(wanted(tmp_path / "b"), jobs=1)
     assert [r | {"times": 0} for r in a] == [r | {"times": 0} for r in b]
@@ -506,6 +507,7 @@ def test_failures_are_a_list_that_is_run_again(tmp_path, edge, monkeypatch, caps
     assert cli.main(["campaign", "--again", "hunt/failures.yaml", "--runs", "2", "--out", "mended", "--json"]) == 0
 
 
+@pytest.mark.system
 def test_a_long_list_of_a_hunts_failures_can_be_read(tmp_path):
     draws = [word for k in range(14) for word in ("--set", f"simulation.valve.of_a_long_name_{k}=1.2345678901234567")]
     record = WHOLE | {"verdict": "slip", "reason": "why" * 20, "command": ["valve-drake", "run", "a #1.yaml", *draws]}
@@ -519,6 +521,7 @@ def listed(path: Path, *seeds: int) -> str:
     return str(path)
 
 
+@pytest.mark.system
 def test_failures_run_again_at_the_same_time_and_more_of_a_list_go_on(tmp_path, fake, monkeypatch, capsys):
     monkeypatch.setenv("TAKES", "1")
     monkeypatch.chdir(tmp_path)

@@ -265,7 +265,7 @@ def drawn_pair(
         {"wider": 1.01},
     ],
 )
-@pytest.mark.parametrize("method", ["refined", "paper"])
+@pytest.mark.parametrize("method", ["refined", pytest.param("paper", marks=pytest.mark.system)])
 def test_a_pair_that_is_not_as_calibrated_is_within_its_covariance_or_refused_in_px(change, method):
     for k, X in enumerate(PLACES):
         images, head = unlike_its_calibration(k, tuple(change.items()))

@@ -392,6 +392,7 @@ def test_where_a_robot_may_stand_at_many_distances_a_few_are_tried_first():
     assert narrow.dense == len(narrow.places)
 
 
+@pytest.mark.system
 def test_places_between_are_tried_where_none_of_the_few_serves():
     X_OA = valve_at(1.0)
     wide = stances(distance_min=0.6, distance_max=1.2)

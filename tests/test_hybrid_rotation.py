@@ -347,6 +347,7 @@ def test_a_held_turn_slows_down_to_rest_keeps_the_grasp_and_goes_on_where_it_sto
     assert status.state == "succeeded" and bench.angle == pytest.approx(0.8, abs=np.radians(1.0))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("spin", [1.0, 100.0])
 def test_a_seized_valve_is_stuck_without_wind_up(spin):
     bench = grasped(1e4, spin=spin)
@@ -494,6 +495,7 @@ def test_a_sensor_that_reports_nonsense_is_a_fault_at_once_and_the_hands_hold_st
     assert np.linalg.norm(bench.load[:, 3:]) < 1e-6
 
 
+@pytest.mark.system
 def test_the_end_of_reach_ends_the_turn():
     bench = grasped(0.5, bar=2.5)
     status = bench.run(Mode.TURN, 2 * np.pi)

@@ -21,6 +21,7 @@ from valve_drake.stations.simulation_config import MishapConfig
 LEVELS = sorted((resources.diagrams() / "levels").glob("level5_*.scenario.yaml"))
 
 
+@pytest.mark.system
 def test_a_valve_stiffens_evenly_from_closed_to_open():
     valve = dc.replace(VALVE, friction=2.0, friction_open=12.0, travel=1.0)
     hands = Hands(at_handle(LEFT), at_handle(RIGHT), valve=valve)
@@ -97,6 +98,7 @@ def test_wheels_that_slip_take_the_base_less_far_than_odometry_says():
     assert believed - driven == pytest.approx(0.8 * 0.5 * 0.4, abs=0.02)
 
 
+@pytest.mark.system
 def test_the_cameras_see_nothing_while_the_lamps_are_out():
     rig = Rig(["simulation.light.off_at=0.5", "simulation.light.off_for=0.5"])
     bright = [rig.run(time).read("head_left.image").image.mean() for time in (0.4, 0.9, 1.4)]

@@ -388,6 +388,7 @@ def test_red_and_green_things_stand_clear_of_the_valve_and_of_the_way():
     assert found == 6  # plant and exit sign, extinguisher, tool box, hand wheel, crate, warning sign
 
 
+@pytest.mark.system
 def test_meshes_are_what_the_script_makes_and_small(tmp_path):
     spec = importlib.util.spec_from_file_location("make_meshes", MODELS / "make_meshes.py")
     script = importlib.util.module_from_spec(spec)

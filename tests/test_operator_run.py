@@ -51,6 +51,7 @@ def short(tmp_path_factory):
     return session, path
 
 
+@pytest.mark.system
 def test_words_begin_and_stop_a_run_and_the_log_holds_them_with_the_sound(short):
     session, path = short
     assert [mode for _, mode in session.modes] == ["idle", "search", "stopped"]
@@ -66,6 +67,7 @@ def test_words_begin_and_stop_a_run_and_the_log_holds_them_with_the_sound(short)
     assert np.frombuffer(sound.data, "<i2").tolist() == [99] * 1280
 
 
+@pytest.mark.system
 def test_a_stop_changes_the_mode_within_a_tenth_of_a_second(short):
     session, path = short
     log = LogReader(path)
@@ -74,10 +76,12 @@ def test_a_stop_changes_the_mode_within_a_tenth_of_a_second(short):
     assert 0 <= stopped - sent <= 0.1
 
 
+@pytest.mark.system
 def test_the_replay_decides_the_same(short, capsys):
     assert replayed(short[1], capsys)
 
 
+@pytest.mark.system
 def test_the_same_words_at_the_same_times_give_the_same_decisions_whoever_speaks(short, tmp_path):
     """The desks' numbers are random; what is decided is not."""
     session, path = short
@@ -93,6 +97,7 @@ def test_the_same_words_at_the_same_times_give_the_same_decisions_whoever_speaks
     assert again.modes == session.modes
 
 
+@pytest.mark.system
 def test_a_replay_cannot_change_whether_operators_are_heard(short, capsys):
     assert cli.main(["replay", str(short[1]), "--set", "operator_channel.wire=none"]) == 2
     assert "operator_channel.wire" in capsys.readouterr().err

@@ -27,6 +27,7 @@ def test_its_file_is_short():
     assert len(lines) < 80
 
 
+@pytest.mark.system
 def test_the_wiring_is_the_reviewed_one(scenario):
     """If this fails: look at the difference, then run `valve-drake draw pr2.scenario.yaml`."""
     system = diagram.make_diagram(scenario).diagram

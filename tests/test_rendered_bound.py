@@ -1,12 +1,14 @@
 """rendered_bound: the estimator on the images of the simulated cameras, beside the bound."""
 
 import numpy as np
+import pytest
 
 from valve_drake.analysis import rendered_bound as mut
 from valve_drake.cli import main
 from valve_drake.stations.simulation_config import CameraConfig
 
 
+@pytest.mark.system
 def test_the_error_on_rendered_images_is_a_small_multiple_of_the_bound_and_its_covariance_covers_it():
     rows = mut.rendered_bound(trials=6, bands=((0.9, 1.4),))["rows"]
     assert [row["cameras"] for row in rows] == ["one", "two"]
@@ -17,6 +19,7 @@ def test_the_error_on_rendered_images_is_a_small_multiple_of_the_bound_and_its_c
     assert rows[1]["mm"] < rows[0]["mm"] < 0.5
 
 
+@pytest.mark.system
 def test_the_same_seed_gives_the_same_figures():
     first, second = (mut.rendered_bound(seed=3, trials=1, bands=((0.6, 0.9),)) for _ in range(2))
     assert first == second

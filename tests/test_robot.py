@@ -601,9 +601,9 @@ def test_no_key_of_our_file_is_left_at_a_default_by_mistake():
 
 def literals(path: Path) -> set[str]:
     """All texts of a module but its docstrings; of an f-string, the parts between its fields."""
-    tree = ast.parse(path.read_text())
-    documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    texts = (n for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str))
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    documents = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    texts = (n for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str))
     return {node.value for node in texts if id(node) not in documents}
 
 

@@ -59,6 +59,7 @@ print(document())
 """
 
 
+@pytest.mark.system
 def test_the_page_has_two_files_and_its_changes_fit_the_program(program):
     assert [name for kind, name, _ in BLOCKS if kind == "python"] == [
         "valve_drake/behaviors/nod.py",
