@@ -28,13 +28,22 @@ Read = Callable[[float], Any]  # time [s] -> value
 _SLOTS = round(TICK / SLOT)  # of a tick
 
 
+class _Kept(Held):
+    """A memory that is not locked: there is no clone that could share it, and what a run locks a replay need not."""
+
+    __slots__ = ()
+
+    def __init__(self, value: Any, asleep: int | None = None, before: Any = None):
+        self.value, self.asleep = value, asleep
+
+
 class _Played:
     """A block with its memory, its wired inputs and its times."""
 
     def __init__(self, block: Block[Any, Any]):
         self.block = block
         self.stepped: Block[Any, Any] | _Shown = block
-        self.held: Any = Held(block.initial())
+        self.held: Any = _Kept(block.initial())
         self.ports = {port: f"{block.get_name()}.{port}" for port in block.OUTPUTS}
         self.sources: dict[str, Source] = {}
         self.asleep: ModeState | None = None  # in what it was found asleep: it sleeps on while this is the mode

@@ -78,9 +78,9 @@ class Comparison:
         self.first: Divergence | None = None
         self._log = log
         self._kinds: dict[str, type[Proto]] = {}  # that were written, by topic
-        self._recorded = itertools.groupby(log.records(list(self.topics), end=end), lambda record: record.when)
+        self._recorded = log.instants(self.topics, end)
         self._next = next(self._recorded, None)
-        self._when = 0  # [ns]
+        self._time, self._when = 0.0, 0  # of the last messages that were written [s, ns]
         self._replayed: list[tuple[str, bytes]] = []  # at that time
         self._alike: collections.Counter[tuple[str, ...]] = collections.Counter()  # instants, by what was equal in them
 
@@ -95,10 +95,9 @@ class Comparison:
     def write(self, topic: str, message: schemas.Loggable, time: float) -> None:
         if topic.startswith(UNCOMPARED):
             return
-        when = nanoseconds(time)
-        if when != self._when:
+        if time != self._time and (when := nanoseconds(time)) != self._when:
             self._settle()
-            self._when = when
+            self._time, self._when = time, when
         self._kinds[topic], data = message if isinstance(message, schemas.Encoded) else schemas.serialized(message)
         self._replayed.append((topic, data))
 
@@ -129,8 +128,8 @@ class Comparison:
 
     def _compare_next(self, replayed: list[tuple[str, bytes]]) -> None:
         assert self._next is not None
-        when, records = self._next
-        self._compare(when, [(record.topic, record.data) for record in records], replayed)
+        when, recorded = self._next
+        self._compare(when, recorded, replayed)
         self._next = next(self._recorded, None)
 
     def _compare(self, when: int, recorded: list[tuple[str, bytes]], replayed: list[tuple[str, bytes]]) -> None:

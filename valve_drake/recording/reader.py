@@ -5,6 +5,7 @@ be read is listed in `damage`, one line each, and everything else can be read.
 """
 
 import dataclasses as dc
+import functools
 import mmap
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ from valve_drake.recording import schemas
 from valve_drake.recording.container import RECOVERED, active
 from valve_drake.recording.contents import Contents
 from valve_drake.recording.foxglove import NANO
-from valve_drake.recording.records import HEAD, ROW, Frame, attachment, attachment_to
+from valve_drake.recording.records import HEAD, ROW, Buffer, Frame, attachment, attachment_to
 from valve_drake.recording.tables import Table, table
 
 LONGEST = 200  # a reason in an error line is cut to this [characters]
@@ -107,6 +108,22 @@ class LogReader:
             raise ConfigError(f"{self.path} has no topic {name}")
         wanted = {id for name in names for id in self._by_topic[name]}
         return self._select(wanted, start, end)
+
+    def instants(self, topics: Iterable[str], end: float = np.inf) -> Iterator[tuple[int, list[tuple[str, bytes]]]]:
+        """The messages of `topics` with time <= end [s], as they follow each other: time [ns], and topic and bytes of
+        each of that time."""
+        wanted = {id for name in topics for id in self._by_topic[name]}
+        when = -1
+        found: list[tuple[str, bytes]] = []
+        for content, rows in self._rows(wanted, -np.inf, end):
+            for position, length, channel, _, at, _ in rows:
+                if at != when:
+                    if found:
+                        yield when, found
+                    when, found = at, []
+                found.append((self._name_of[channel][0], content[position + _DATA : position + HEAD.size + length]))
+        if found:
+            yield when, found
 
     def messages(
         self, topics: Iterable[str] | None = None, start: float = -np.inf, end: float = np.inf
@@ -200,8 +217,21 @@ class LogReader:
         return topics
 
     def _select(self, wanted: set[int], start: float, end: float) -> Iterator[Record]:
-        names = {id: (topic, k) for topic, ids in self._by_topic.items() for k, id in enumerate(ids)}
-        bounded = start > -np.inf or end < np.inf
+        for content, rows in self._rows(wanted, start, end):
+            for position, length, channel, sequence, when, published in rows:
+                topic, k = self._name_of[channel]
+                yield Record(
+                    topic, when, sequence, content[position + _DATA : position + HEAD.size + length], published, k
+                )
+
+    @functools.cached_property
+    def _name_of(self) -> dict[int, tuple[str, int]]:
+        """Of each channel its topic, and which one of the topic's it is."""
+        return {id: (topic, k) for topic, ids in self._by_topic.items() for k, id in enumerate(ids)}
+
+    def _rows(self, wanted: set[int], start: float, end: float) -> Iterator[tuple[Buffer, Iterator[tuple[int, ...]]]]:
+        """Block by block its content, and of the wanted messages in it: position, length, channel, sequence, time and
+        time of publishing [ns]."""
         for block in self._contents.blocks:
             if block.first / NANO > end or block.last / NANO < start or wanted.isdisjoint(block.channels):
                 continue
@@ -212,12 +242,10 @@ class LogReader:
                 positions, rows = positions[match], rows[match]
             content = self._contents.content(block)
             columns = (rows[name].tolist() for name in ("length", "channel", "sequence", "when", "published"))
-            for position, length, channel, sequence, when, published in zip(positions.tolist(), *columns):
-                if bounded and not start <= when / NANO <= end:
-                    continue
-                data = content[position + _DATA : position + HEAD.size + length]
-                topic, k = names[channel]
-                yield Record(topic, when, sequence, data, published, k)
+            found: Iterator[tuple[int, ...]] = zip(positions.tolist(), *columns)
+            if not start <= block.first / NANO or not block.last / NANO <= end:
+                found = (row for row in found if start <= row[4] / NANO <= end)
+            yield content, found
 
     def _decoder(self, record: Record) -> _Decoder:
         id = self._by_topic[record.topic][record.channel]
