@@ -54,25 +54,22 @@ class _Played:
 class _Message:
     """What a block that is left out sent at one time; read when somebody looks at it."""
 
-    def __init__(self, read: Callable[[], Any]):
-        self._read = read
+    def __init__(self, decode: Callable[[Any], Any], recorded: Any):
+        self._decode, self._recorded = decode, recorded
 
     @functools.cached_property
     def value(self) -> Any:
-        return self._read()
+        return self._decode(self._recorded)
 
 
 class _Shown:
     """Stands for a block that is left out: at its times its ports get what the next tick has recorded of them."""
 
-    def __init__(self, block: Block[Any, Any], recording: Recording):
-        self._sent: dict[int, dict[str, _Message]] = {}  # by the tick that recorded it
-        for port in block.OUTPUTS:
-            for tick, read in recording.sent(topic_of(f"{block.get_name()}.{port}")):
-                self._sent.setdefault(tick, {})[port] = _Message(read)
+    def __init__(self) -> None:
+        self.sent: dict[int, dict[str, _Message]] = {}  # by the tick that recorded it
 
     def update(self, work: Step, time: float, *_: Any) -> tuple[None, dict[str, _Message]]:
-        return None, self._sent.get(math.floor(time / TICK) + 1, {})
+        return None, self.sent.get(math.floor(time / TICK) + 1, {})
 
 
 class Player:
@@ -96,7 +93,8 @@ class Player:
         self._values: dict[str, Any] = {OPERATOR: OperatorCommand(), PACKETS: OperatorPackets()}
         self._station, self._joined = shown(recording), recording.joined
         blocks = [_Played(block) for block in make_blocks(scenario)]
-        self._left_out = {name for played in blocks if not plays(name := played.block.get_name())}
+        self._left_out = {name: _Shown() for played in blocks if not plays(name := played.block.get_name())}
+        self._looked_at = {"supervisor.mode"}  # what is read of those that are left out
         for played in blocks:
             for port, value in played.block.initial_outputs().items():
                 self._values[played.ports[port]] = value
@@ -105,13 +103,14 @@ class Player:
             name = played.block.get_name()
             if name in self._left_out:
                 for port in played.ports.values():
-                    self._values[port] = _Message(functools.partial(lambda value: value, self._values[port]))
-                played.stepped = _Shown(played.block, recording)
+                    self._values[port] = _Message(_itself, self._values[port])
+                played.stepped = self._left_out[name]
                 continue
             for port, declared in played.block.sources.items():
                 read = self._read(wires[f"{name}.{port}"])
                 played.sources[port] = declared._replace(port=_Wired(), evaluate=read)
         recorder.listen(self._recorded)
+        self._show(recording)
         self._blocks = blocks
         cycle = math.lcm(*(period for played in blocks for period, _, _ in played.works))
         # Which works are due in each slot of a cycle; `offset` is when a work is due first.
@@ -173,8 +172,19 @@ class Player:
         if block == "station":
             return self._station[port]
         if block in self._left_out:
+            self._looked_at.add(source)
             return lambda time: self._values[source].value
         return lambda time: self._values[source]
+
+    def _show(self, recording: Recording) -> None:
+        """Has the blocks that are left out show what they sent, as far as somebody looks at it."""
+        ports = {
+            topic_of(source): source.split(".") for source in self._looked_at if source.split(".")[0] in self._left_out
+        }
+        for record in recording.sent(ports):
+            block, port = ports[record.topic]
+            sent = self._left_out[block].sent.setdefault(round(record.time / TICK), {})
+            sent[port] = _Message(recording.decode, record)
 
     def _recorded(self, name: str) -> Read | None:
         """What a port of the recorder shows; None if that is not in a recording."""
@@ -188,6 +198,10 @@ class Player:
         if source.startswith("station.truth.") or not there or (source == PACKETS and not self._listens):
             return None
         return self._read(source)
+
+
+def _itself(value: Any) -> Any:
+    return value
 
 
 class _Wired:

@@ -109,11 +109,12 @@ class Recording:
                 if frame.sequence >= 0 and time <= self.end and (f"/{camera}/image", time) not in images:
                     raise ConfigError(f"{log.path} lacks the image {frame.sequence} of {camera} at t = {time:.3f} s")
 
-    def sent(self, topic: str) -> Iterator[tuple[int, Callable[[], Any]]]:
-        """The messages of a topic, none if the log lacks it: the tick that recorded each, and what reads it."""
-        if topic in self._log.topics:
-            for record in self._log.records([topic]):
-                yield round(record.time / TICK), functools.partial(self._log.decode, record)
+    def sent(self, topics: Iterable[str]) -> Iterator[Record]:
+        """The messages of those of the topics that the log has; `decode` reads one."""
+        return self._log.records(self._log.topics.keys() & topics)
+
+    def decode(self, record: Record) -> Any:
+        return self._log.decode(record)
 
     def frame(self, time: float, header: CameraFrame) -> CameraFrame:
         """The frame with its image, as recorded at `time`."""
