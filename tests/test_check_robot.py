@@ -137,7 +137,11 @@ LACKS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", LACKS)
+QUICK = ("no second eye", "no tilt", "narrow hands", "a model that contradicts it")
+CASES = [case if case in QUICK else pytest.param(case, marks=pytest.mark.system) for case in LACKS]
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_what_a_robot_lacks_is_said_with_its_key(case, tmp_path, monkeypatch):
     monkeypatch.setattr(robot_check, "_reach", lambda *arguments: None)  # it takes long, and is no matter here
     edit, change, level, words = LACKS[case]

@@ -65,6 +65,7 @@ def test_marker_is_the_best_candidate_at_every_distance_and_light(z, finish):
     assert polygon_area(candidates[0].corners) > 0.7 * 0.7 * side**2
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("z", [0.5, 0.7, 2.0])  # the near ones are cut out of the half image
 def test_outline_lies_as_far_inside_on_either_side(z):
     rng, off = np.random.default_rng(4), []

@@ -202,6 +202,7 @@ MISTAKES = [
 ]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(("change", "says"), MISTAKES)
 def test_poses_of_a_usual_mistake_are_refused_with_its_name(command, tmp_path, change, says):
     code, _, err = command(change)

@@ -34,6 +34,7 @@ def test_speed_and_acceleration_stay_within_their_limits(size):
         assert np.mean((lead[1:] | push)[inside]) > 0.95
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("size", [0.05, 0.5, 2.0])
 def test_no_joint_is_faster_than_its_own_limit_and_one_of_them_is_as_fast(size):
     limits = np.array([0.1, 2.0, 0.5, 0.4, 3.0, 0.9] * 2)

@@ -106,6 +106,7 @@ def test_a_fixed_robot_finds_a_valve_within_its_reach_with_the_head_alone(bearin
     assert world.base.tolist() == [0, 0, 0]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("pan", [0.7, 1.0, 1.3, 1.37])
 def test_a_head_that_turns_little_leaves_no_direction_out(pan):
     """Without a waist, and with a neck that follows late: turns of the base close what the sweeps leave open."""
