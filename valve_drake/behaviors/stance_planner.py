@@ -1,6 +1,7 @@
 """Where to stand, how to hold the valve, how the arms get there: the searches, beside the control loop.
 
-    fine_approach  the stance for the whole turn, from the last few estimates, again every `period`
+    fine_approach  the stance for the whole turn, from the last few estimates. With each estimate it moves along with
+                   the valve; it is searched again, at most every `period`, if the valve is seen higher or tilted
     a PlanRequest  grasps from where the robot stands, or a collision-free path of both arms
 
 A search takes up to some seconds of processor time. It is cut into portions of 2 to 5 ms, one portion a step, so that
@@ -45,7 +46,7 @@ class StancePlannerConfig(Config):
     """Scenario key `stance_planner`."""
 
     KEY = "stance_planner"
-    period: float = number(0.5, 0.1, 10.0, "between two computations of the stance [s]")
+    period: float = number(0.5, 0.1, 10.0, "between two searches for the stance [s]")
 
 
 @dc.dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Memory:
     looks: tuple[RectangleEstimate, ...] = ()
     search: StanceSearch | None = None
     last: StanceSearch | None = None  # the one before, if it has found a stance
-    searched: RectangleEstimate = RectangleEstimate()  # the newest estimate that `search` is made from
+    searched: RectangleEstimate = RectangleEstimate()  # the newest estimate that was taken into account
     begun: float = -1e9  # when the last search for a stance began [s]
     stance: Stance = Stance()
     number: int = -1  # of the last request
@@ -98,15 +99,19 @@ class StancePlanner:
         if self.stances.valve.seen_by(estimate) and (not m.looks or estimate.sequence != m.looks[-1].sequence):
             m = changed(m, looks=(*m.looks, estimate)[-LOOKS:])
         if m.search is None:
-            due = not m.stance.found or time - m.begun >= self.config.period
-            if not due or not m.looks or m.looks[-1] is m.searched:
+            if not m.looks or m.looks[-1] is m.searched:
                 return m
+            m, before = changed(m, searched=m.looks[-1]), m.last
             fused = fuse(m.looks)
-            m = changed(m, searched=m.looks[-1], begun=time)
             if not fused.found:
                 return m
             X_OA, viewer = self.stances.valve.place(fused.X_OV, fused.angle), m.looks[-1].X_OL[:2, 3]
-            m = changed(m, search=self.stances.begin(X_OA, mode.turn_angle, viewer, m.last))
+            base = None if before is None else self.stances.moved(before, X_OA, mode.turn_angle)
+            if base is not None and m.stance.found:
+                return changed(m, stance=dc.replace(m.stance, time=m.searched.time, base=base))
+            if m.stance.found and time - m.begun < self.config.period:
+                return m
+            m = changed(m, begun=time, search=self.stances.begin(X_OA, mode.turn_angle, viewer, before))
         assert m.search is not None
         search = self.stances.advance(m.search)
         if not search.done:

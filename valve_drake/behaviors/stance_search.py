@@ -7,11 +7,15 @@ import numpy as np
 from valve_drake.behaviors.arc_search import ONE_GRASP, ArcSearch, GraspSearch
 from valve_drake.behaviors.grasp_geometry import Arc, Turn
 from valve_drake.behaviors.stance_config import StanceConfig
-from valve_drake.frames import compose, inverse, planar
+from valve_drake.frames import compose, inverse, planar, rot_z, rotation_vector
 from valve_drake.valve.valve import has_heading, heading, turned
 
 AROUND = (0.5, -0.5, 1.0, -1.0)  # sides from which a valve with an upright axis is tried, off the nearest [rad]
 FEW = 9  # distances of a search's first round
+SAME_HEIGHT, SAME_TILT = (
+    0.01,
+    0.03,
+)  # a valve seen off by less needs no other stance; well below a grasp's room [m, rad]
 AS_GOOD = 0.05  # a place whose margin has fallen by less is as good as it was
 
 
@@ -88,6 +92,20 @@ class Stances(GraspSearch):
             wanted=max(last.margin - AS_GOOD, self.config.margin_min),
             instead=afresh,
         )
+
+    def moved(self, search: StanceSearch, X_OA: np.ndarray, turn_angle: float) -> np.ndarray | None:
+        """The base (x, y, heading) of a search's stance, moved along with a valve that is now seen at X_OA.
+
+        None where the valve is another to the arms: higher, tilted or turned, or seen elsewhere by a robot that cannot
+        move.
+        """
+        if search.best is None or self.bolted or turn_angle != search.turn_angle:
+            return None
+        off = _swing(search.X_OA, X_OA)
+        tilt = rotation_vector(rot_z(off) @ search.X_OA[:, :3] @ X_OA[:, :3].T)
+        if abs(X_OA[2, 3] - search.X_OA[2, 3]) > SAME_HEIGHT or np.linalg.norm(tilt) > SAME_TILT:
+            return None
+        return _moved(search.best.base, search.X_OA, X_OA)
 
     def _places(
         self, X_OA: np.ndarray, viewer: np.ndarray, posture: np.ndarray | None
@@ -188,9 +206,14 @@ def _before(stem: np.ndarray, distance: float, angle: float) -> np.ndarray:
 
 def _moved(base: np.ndarray, X_OA: np.ndarray, X_OA1: np.ndarray) -> np.ndarray:
     """The base (x, y, heading) that stands to the valve at X_OA1 as `base` does to the one at X_OA."""
-    off = 0.0
-    if has_heading(X_OA) and has_heading(X_OA1):
-        off = heading(X_OA1, np.zeros(2)) - heading(X_OA, np.zeros(2))
+    off = _swing(X_OA, X_OA1)
     x, y = base[:2] - X_OA[:2, 3]
     c, s = np.cos(off), np.sin(off)
     return np.array([X_OA1[0, 3] + c * x - s * y, X_OA1[1, 3] + s * x + c * y, base[2] + off])
+
+
+def _swing(X_OA: np.ndarray, X_OA1: np.ndarray) -> float:
+    """The angle on the floor from where one valve looks to where the other does; of an upright axis 0."""
+    if not (has_heading(X_OA) and has_heading(X_OA1)):
+        return 0.0
+    return heading(X_OA1, np.zeros(2)) - heading(X_OA, np.zeros(2))

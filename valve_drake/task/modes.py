@@ -130,7 +130,7 @@ ROWS = (
         next=Mode.MEASURE,
         deadline=45.0,
         watched=True,
-        head_every=2,
+        head_every=3,
         retry=_SEARCH_AGAIN,
     ),
     Row(
