@@ -162,6 +162,15 @@ def test_a_valve_out_of_reach_is_refused_and_one_of_several_is_doubtful(capsys):
     assert report.usable and "reach : the scenario's valve at 1.6 m is out of reach" in said(report, DOUBTFUL)
 
 
+def test_a_valve_that_no_hand_can_hold_is_said_once_and_nothing_is_reached_for(tmp_path):
+    near = "[{xyz: [0.06, 0, 0]}, {xyz: [-0.06, 0, 0]}]"
+    report = checked("robot/robot.yaml", "valve.model=''", f"valve.handles={near}")
+    missing = said(report, MISSING)
+    assert len(missing) == 1 and missing[0].startswith("grasp : valve.handles[0].xyz must be at least 0.1")
+    assert not report.reach
+    assert "valve.handles[0].xyz" in robot_check_page.page(report)
+
+
 def test_a_wrong_file_is_bad_input(tmp_path, capsys):
     assert cli.main(["check-robot", str(tmp_path / "nobody.yaml")]) == 2
     path = variant(tmp_path, change=at("opening", "wide"))

@@ -179,15 +179,17 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
     _base(report, robot)
     collision = CollisionModel(robot)
     _home(report, robot, collision)
+    refused = ""
     try:
         check_handles(collision, scenario.valve)
     except ConfigError as error:
-        report.add(MISSING, "grasp", "", str(error))
+        refused = str(error)
+        report.add(MISSING, "grasp", "", refused)
     _servoing(report, robot, scenario)
     _grippers(report, robot, scenario)
     _servos(report, robot)
     report.friction = _most(scenario.simulation.valve.friction)
-    best = _reach(report, robot, scenario, collision)
+    best = None if refused else _reach(report, robot, scenario, collision)  # no hand holds it: nothing to reach for
     _eyes(report, robot, scenario, best, pictures)
     _rest(report, scenario)
     report.seconds = time.process_time() - start
