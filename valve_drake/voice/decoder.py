@@ -71,7 +71,7 @@ class Tree:
 
 
 class Decoder:
-    """arrays: of `weights`. Works in 32 bits, in one thread of numpy's."""
+    """arrays: of `weights`. Works in 32 bits; tiny.en's takes 0.12 GB of memory."""
 
     def __init__(self, arrays: dict[str, np.ndarray]) -> None:
         def of(name: str) -> np.ndarray:
