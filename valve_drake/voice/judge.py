@@ -115,13 +115,12 @@ class Judge:
     def look(self, sound: np.ndarray, seconds: float) -> Look:
         """sound: (m,) int16. seconds: to which silence fills it up."""
         seen = self._encoder.frames(sound, seconds)
-        return Look(
-            self._net.probabilities(rows(seen, len(sound))),
-            lambda texts: self._decoder.likelihoods(seen, self._tree(tuple(texts))),
-        )
 
-    def _tree(self, texts: tuple[str, ...]) -> decoder.Tree:
-        return decoder.Tree(self._start, [self._tokens.of(text) for text in texts])
+        def likelihoods(texts: Sequence[str]) -> np.ndarray:
+            tree = decoder.Tree(self._start, [self._tokens.of(text) for text in texts])
+            return self._decoder.likelihoods(seen, tree)
+
+        return Look(self._net.probabilities(rows(seen, len(sound))), likelihoods)
 
 
 def _no_model(folder: Path, error: Exception) -> ConfigError:
