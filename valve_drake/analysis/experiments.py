@@ -12,6 +12,7 @@ out pixels nearer than 3 px to a corner: the usual bound for points along the fo
 import dataclasses as dc
 import functools
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -560,10 +561,10 @@ def rendered(seed: int = 0, trials: int = 100) -> dict[str, Any]:
 
 
 def voice(seed: int = 0, trials: int = 60) -> dict[str, Any]:
-    """See voice/experiment.py. trials: minutes of other speech."""
+    """See voice/experiment.py. trials: minutes of other speech. It takes long, and says how far it is."""
     from valve_drake.voice import experiment
 
-    return experiment.run(seed, trials)
+    return experiment.run(seed, trials, lambda line: print(line, file=sys.stderr, flush=True))
 
 
 EXPERIMENTS: dict[str, Callable[..., dict[str, Any]]] = {
