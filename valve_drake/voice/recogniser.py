@@ -59,10 +59,11 @@ FILLED = 6.0  # to which silence fills a sentence up, what the second ear is use
 # `stop`: the network alone is believed from STOP_SURE; beside a second ear it is asked between these two.
 STOP_MAYBE = 0.04  # lower: fewer are missed, the second ear is asked more often (30 ms each)
 STOP_CERTAIN = 0.97  # lower: fewer are missed, more are heard in other words
-STOP_HEARD = 0.5  # share of the logarithm of the odds that the second ear heard the word, beside that it would write it
-STOP_LIKELY = -2.0  # their sum from which it is one; lower: fewer are missed, more are heard in other words
+STOP_HEARD = 0.5  # share of the ln of the odds that the second ear heard the word, beside that it would write it
+STOP_LIKELY = -3.3  # their sum from which it is one; lower: fewer are missed, more are heard in other words
 # It is asked too one step after a short burst of speech, whatever the network says: the word is noticed sooner so.
 BURST = 2, 12  # steps of such a burst; wider: fewer `stop` within longer speech are missed, more asking
+BURST_LIKELY = -2.5  # instead of STOP_LIKELY there; lower: as above
 STOP_BACK, STOP_FILLED = 1.0, 3.0  # of sound that it is asked about, and to which silence fills it up [s]
 _EARLY = 0.1  # probability of `confirm` from which it is asked whether the sentence is no more than that
 
@@ -242,12 +243,11 @@ def _stop(probability: float, ended: bool, second: SecondEar | None) -> float:
         return score(probability, STOP_SURE)
     if probability < STOP_MAYBE and not ended:
         return 0.0
+    needed = STOP_LIKELY if probability >= STOP_MAYBE else BURST_LIKELY
     look = second.look(STOP_BACK, STOP_FILLED)
-    heard = float(np.clip(look.words[:, INDEX["stop"]].max(), 1e-6, 1 - 1e-6))
-    found = STOP_HEARD * math.log(heard / (1 - heard)) - STOP_LIKELY
-    if found >= 0.0:  # else no probability that it would write it could be enough
-        found += float(look.likelihoods([*judges.written("stop"), *judges.written(f"{grammar.WAKE} stop")]).max())
-    return 1 / (1 + math.exp(-found))
+    found = float(look.likelihoods([*judges.written("stop"), *judges.written(f"{grammar.WAKE} stop")]).max())
+    heard = float(np.clip(look.words[:, INDEX["stop"]].max(), 0.5, 1 - 1e-6))  # it may speak for it, never against it
+    return 1 / (1 + math.exp(needed - found - STOP_HEARD * math.log(heard / (1 - heard))))
 
 
 def _without(p: np.ndarray, words: list[str]) -> np.ndarray:
