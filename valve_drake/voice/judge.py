@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 
 from valve_drake.checks import ConfigError
-from valve_drake.voice import decoder
 from valve_drake.voice.embedding import BLOCK
 from valve_drake.voice.radio import RATE
 from valve_drake.voice.word_net import WordNet, shipped
 
 # What is written as said before. Whisper goes on in its spelling: digits, commas, full stops.
 BEFORE = " Robot, open the valve. Robot, close the valve half way. Robot, status. Stop. Confirm."
+LEAST = 1e-20  # a token's probability counts as no less
+TOGETHER = 3  # sentences that the decoder is given at once; more take more memory, and no less time
 _WINDOW, _HOP, _BANDS = 400, 160, 80  # of the spectrum [samples], and numbers each 10 ms
 _RANGE = 8.0  # below the loudest all is as quiet [powers of ten]
 
@@ -53,7 +54,9 @@ class Look:
 
 
 class Encoder:
-    """Whisper's first half. One thread, weights of 8 bits: the same sound gives the same numbers.
+    """Whisper's first half, `frames`, and the whole. One thread, weights of 8 bits: the same sound, the same numbers.
+
+    model: CTranslate2's. view: makes of an array what it takes.
 
     Raises ConfigError where the packages are missing or their model cannot be read.
     """
@@ -70,19 +73,19 @@ class Encoder:
             raise ConfigError(f"the second ear cannot be loaded: {' '.join(str(error).split())}") from None
         self.folder = Path(get_model_path())
         try:
-            self._model: Any = ctranslate2.models.Whisper(
+            self.model: Any = ctranslate2.models.Whisper(
                 str(self.folder), device="cpu", inter_threads=1, intra_threads=1, compute_type="int8"
             )
         except (OSError, RuntimeError, ValueError) as error:
             raise _no_model(self.folder, error) from None
-        self._view = ctranslate2.StorageView.from_array
+        self.view: Any = ctranslate2.StorageView.from_array
 
     def frames(self, sound: np.ndarray, seconds: float) -> np.ndarray:
         """(m,) int16, filled up to `seconds` with silence -> (n, width), 20 ms each."""
         filled = max(round(seconds * RATE), len(sound) + RATE // 5)
         samples = np.zeros(-(-filled // (2 * _HOP)) * 2 * _HOP, np.float32)
         samples[: len(sound)] = np.asarray(sound, np.float32) / 32768
-        return np.array(self._model.encode(self._view(np.ascontiguousarray(spectrum(samples)[None]))))[0]
+        return np.array(self.model.encode(self.view(np.ascontiguousarray(spectrum(samples)[None]))))[0]
 
 
 def rows(frames: np.ndarray, count: int) -> np.ndarray:
@@ -106,19 +109,25 @@ class Judge:
         folder = self._encoder.folder
         try:
             self._tokens = _Tokens(folder / "tokenizer.json")
-            self._decoder = decoder.Decoder(decoder.weights(folder / "model.bin"))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise _no_model(folder, error) from None
-        start, plain = (self._tokens.special[f"<|{name}|>"] for name in ("startoftranscript", "notimestamps"))
-        self._start = [self._tokens.special["<|startofprev|>"], *self._tokens.of(BEFORE), start, plain]
+        before, start = (self._tokens.special[f"<|{name}|>"] for name in ("startofprev", "startoftranscript"))
+        self._start = [before, *self._tokens.of(BEFORE), start]
 
     def look(self, sound: np.ndarray, seconds: float) -> Look:
         """sound: (m,) int16. seconds: to which silence fills it up."""
         seen = self._encoder.frames(sound, seconds)
 
         def likelihoods(texts: Sequence[str]) -> np.ndarray:
-            tree = decoder.Tree(self._start, [self._tokens.of(text) for text in texts])
-            return self._decoder.likelihoods(seen, tree)
+            return np.array([each for k in range(0, len(texts), TOGETHER) for each in some(texts[k : k + TOGETHER])])
+
+        def some(texts: Sequence[str]) -> list[float]:
+            view = self._encoder.view(np.tile(seen, (len(texts), 1, 1)))
+            tokens = [self._tokens.of(text) for text in texts]
+            found = self._encoder.model.align(  # at which times is not asked, so they need no filter
+                view, self._start, tokens, [2 * len(seen)] * len(texts), median_filter_width=1
+            )
+            return [float(np.log(np.maximum(each.text_token_probs, LEAST)).sum()) for each in found]
 
         return Look(self._net.probabilities(rows(seen, len(sound))), likelihoods)
 

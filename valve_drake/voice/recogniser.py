@@ -44,7 +44,7 @@ SENTENCE_SURE = 0.5  # of a meaning, within the grammar and FOREIGN; lower: fewe
 WAKE_SURE = 0.95  # of the wake phrase alone, against all other speech; lower: other speech is listened to more often
 FOREIGN = 0.07  # weight of all that is no sentence of the grammar; higher: less other speech is taken for one
 DEAF = 6  # steps after a `stop` or `confirm` in which the same word is not heard again
-ASKED = 12  # sentences that the second ear's decoder is asked about; more cost time (5 ms each)
+ASKED = 12  # sentences that the second ear's decoder is asked about; more cost time (10 ms each)
 # ln of a sentence's weight: shares of the logarithms of three probabilities: of the network, of the words that the
 # second ear heard, and that it would write the sentence; and WORD for each word. All above 1 would count thrice what
 # they have in common.
