@@ -1,8 +1,5 @@
 """collision: what the controllers' own model of robot, valve and panel calls free."""
 
-import dataclasses as dc
-import re
-
 import numpy as np
 import pytest
 from robot_facts import ARMS_HOME as HOME
@@ -13,14 +10,13 @@ from valve_drake.behaviors.grasp_geometry import Turn, standoff
 from valve_drake.behaviors.stance_config import StanceConfig
 from valve_drake.behaviors.stance_search import Stances
 from valve_drake.checks import ConfigError
-from valve_drake.collision import CollisionModel, check_handles
+from valve_drake.collision import CollisionModel
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import SIDES
-from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
 from valve_drake.stations.scene import panel_pose
 from valve_drake.stations.simulation_config import ValveConfig
-from valve_drake.valve.valve import HandleConfig, MarkerConfig, Valve, turned
+from valve_drake.valve.valve import Valve, turned
 
 VALVE = Valve()
 ON_BAR = (0.0, 0.03, 0.0)  # off the handle, in the hand: a finger touches the bar [m]
@@ -179,52 +175,9 @@ def test_a_file_that_is_no_srdf_is_refused_in_one_line(tmp_path):
         CollisionModel(robot)
 
 
-def made(radius: float, kind: str = "bar", count: int = 2, **changes) -> Valve:
-    angles = 2 * np.pi * np.arange(count) / count
-    places = [[round(radius * np.cos(a), 4), round(radius * np.sin(a), 4), 0.0] for a in angles]
-    return dc.replace(VALVE, model="", handles=[HandleConfig(kind=kind, xyz=xyz) for xyz in places], **changes)
-
-
-def test_handles_beside_the_markers_plate_are_refused_with_the_least_radius_which_will_do():
-    def look(radius):
-        valve = made(radius)
-        check_handles(CollisionModel(Robot.load(description.find("robot/robot.yaml"), valve)), valve)
-
-    with pytest.raises(ConfigError) as error:
-        look(0.06)
-    said = re.fullmatch(
-        r"valve\.handles\[0\]\.xyz must be at least (0\.1\d+) m off the axis: an open hand there touches the valve "
-        r"\(face\) or is nearer than collision.padding, got \[0.06, 0.0, 0.0\]",
-        str(error.value),
-    )
-    assert said, error.value
-    look(float(said[1]))
-    with pytest.raises(ConfigError, match="at least"):
-        look(float(said[1]) - 0.003)
-
-
-def test_a_wheel_whose_spokes_are_where_hands_would_be_is_refused_by_its_spokes():
-    for spokes in (5, 4):
-        valve = made(0.15, "rim", spokes=spokes, marker=MarkerConfig(size=[0.06, 0.06], face=0.07))
-        model = CollisionModel(Robot.load(description.find("robot/robot.yaml"), valve))
-        if spokes == 4:
-            return check_handles(model, valve)
-        with pytest.raises(
-            ConfigError, match=r"valve.spokes must be fewer, or farther from valve.handles\[0\]: .*got 5"
-        ):
-            check_handles(model, valve)
-
-
 @pytest.mark.parametrize("side", SIDES)
 def test_what_an_open_hand_touches_does_not_depend_on_where_the_arm_is(side, model):
     grasp = VALVE.grasp(0, 1.0)
     assert model.at_handle(side, grasp) == []
     assert model.at_handle(side, make(grasp[:, :3], grasp[:, 3] + grasp[:, :3] @ ON_BAR)) == ["bar"]
     assert model.at_handle(side, make(grasp[:, :3], grasp[:, 3] * 0.4)) != []
-
-
-def test_two_hands_need_two_handles_that_they_can_be_at():
-    """A third one that nobody can hold does not matter."""
-    valve = made(0.15)
-    valve.handles.append(HandleConfig(xyz=[0.0, 0.06, 0.0]))
-    check_handles(CollisionModel(Robot.load(description.find("robot/robot.yaml"), valve)), valve)

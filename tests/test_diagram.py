@@ -126,6 +126,8 @@ def test_imports_point_one_way(path):
         "robot/description.py",
     ):
         assert not any(i.startswith("pydrake") for i in imports), "mathematics stands without Drake"
+    if part in ("robot", "valve", "camera") or str(name) in ("collision.py", "memory.py", "motion.py", "ports.py"):
+        assert not any(i.startswith("valve_drake.behaviors") for i in imports), "behaviors stand on it"
     if part in ("behaviors", "perception", "supervisor"):
         own = "valve_drake." + ".".join(name.with_suffix("").parts)
         for i in imports:

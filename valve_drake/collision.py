@@ -1,6 +1,5 @@
 """Do the arms touch anything? A model of robot, valve and panel for planning, apart from the simulated plant."""
 
-import itertools
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
@@ -19,17 +18,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from valve_drake.behaviors.grasp_geometry import APART
-from valve_drake.checks import ConfigError, require, shown
-from valve_drake.frames import compose, inverse, make
+from valve_drake.checks import ConfigError, shown
+from valve_drake.frames import compose, inverse
 from valve_drake.messages import SIDES
 from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
-from valve_drake.valve.valve import Valve, turned
+from valve_drake.valve.valve import turned
 
 FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the valve's pose while none is known
-
-ROOM = 0.3  # so much farther from the axis a hand is looked for that is clear of the valve, for the error's line [m]
 
 
 def stem_angle(X_BA: np.ndarray) -> float:
@@ -175,45 +171,3 @@ class CollisionModel:
             self._clearance
         )
         return pairs
-
-
-def check_handles(model: CollisionModel, valve: Valve) -> None:
-    """Raises ConfigError if there are no two handles that open hands can be at: they touch the valve at the others."""
-    count = range(len(valve.handles))
-    free = {side: [k for k in count if any(not model.at_handle(side, X) for X in _ways(valve, k))] for side in SIDES}
-    if any(math.dist(valve.radius(i), valve.radius(k)) >= APART for i, k in itertools.product(*free.values())):
-        return
-    handle, side = next((k, side) for side in SIDES for k in count if k not in free[side])
-    way = min(_ways(valve, handle), key=lambda X: len(model.at_handle(side, X)))
-    touched = set(model.at_handle(side, way))
-    words = f"an open hand there touches the valve ({', '.join(sorted(touched))}) or is nearer than collision.padding"
-    fixed = {name for name in touched if not name.startswith("spoke")}  # spokes reach as far as the rim, wherever it is
-    if not fixed:
-        rule = f"fewer, or farther from valve.handles[{handle}]: {words}"
-        raise ConfigError(f"valve.spokes must be {rule}, got {valve.spokes}")
-    extra = _room(model, side, way, fixed)
-    least = math.ceil(1e3 * (math.hypot(*valve.radius(handle)) + (extra or 0.0))) / 1e3
-    rule = "where a hand fits" if extra is None else f"at least {least:g} m off the axis"
-    require(False, f"valve.handles[{handle}].xyz", f"{rule}: {words}", valve.handles[handle].xyz)
-
-
-def _ways(valve: Valve, handle: int) -> list[np.ndarray]:
-    """The poses X_AG of a hand at a handle."""
-    return [valve.grasp(handle, sign) for sign in (1.0, -1.0)]
-
-
-def _room(model: CollisionModel, side: str, X_AG: np.ndarray, touched: set[str]) -> float | None:
-    """How much farther from the axis a hand is clear of these shapes, with the valve as it is [m]; None: nowhere."""
-    outwards = np.array([*X_AG[:2, 3], 0.0]) / math.hypot(*X_AG[:2, 3])
-
-    def touches(extra: float) -> bool:
-        there = make(X_AG[:, :3], X_AG[:, 3] + extra * outwards)
-        return not touched.isdisjoint(model.at_handle(side, there))
-
-    low, high = 0.0, ROOM
-    if touches(high):
-        return None
-    while high - low > 5e-4:
-        middle = (low + high) / 2
-        low, high = (middle, high) if touches(middle) else (low, middle)
-    return high

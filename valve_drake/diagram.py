@@ -19,6 +19,7 @@ from valve_drake import named_files
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.behaviors.blind_servo import STRAIGHT, BlindServo
 from valve_drake.behaviors.grasp_geometry import Turn
+from valve_drake.behaviors.handle_check import check_handles
 from valve_drake.behaviors.hybrid_rotation import HybridRotation
 from valve_drake.behaviors.hybrid_rotation_system import HybridRotationSystem
 from valve_drake.behaviors.image_servo import ImageServo
@@ -33,7 +34,7 @@ from valve_drake.behaviors.valve_search import GazeLimits, ValveSearchConfig, re
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError, require
-from valve_drake.collision import CollisionModel, check_handles
+from valve_drake.collision import CollisionModel
 from valve_drake.config import Uniform
 from valve_drake.frames import compose, inverse, make, planar
 from valve_drake.messages import SIDES, OperatorCommand, OperatorPackets
@@ -307,7 +308,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     collision = CollisionModel(robot)
     if touching := collision.touching(None, robot.home):
         raise ConfigError(f"{scenario.robot}: arms.left.home and arms.right.home must be free of all: {touching[0]}")
-    check_handles(collision, valve)
+    check_handles(collision.at_handle, valve)
     stances = Stances(robot, valve, scenario.stance, view, collision.is_free, collision.pairs, robot.drive.fixed)
     return [
         RobotStateSystem(robot.groups),

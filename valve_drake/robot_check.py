@@ -20,12 +20,13 @@ from pydrake.systems.sensors import CameraInfo
 
 from valve_drake import named_files
 from valve_drake.behaviors.grasp_geometry import Turn
+from valve_drake.behaviors.handle_check import check_handles
 from valve_drake.behaviors.stance_config import StanceConfig
 from valve_drake.behaviors.stance_search import Place, Stances
 from valve_drake.behaviors.taught import load_made_for, load_taught
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError
-from valve_drake.collision import CollisionModel, check_handles
+from valve_drake.collision import CollisionModel
 from valve_drake.config import Uniform
 from valve_drake.diagram import gaze_of, robot_of
 from valve_drake.frames import compose, inverse, planar
@@ -181,7 +182,7 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
     _home(report, robot, collision)
     refused = ""
     try:
-        check_handles(collision, scenario.valve)
+        check_handles(collision.at_handle, scenario.valve)
     except ConfigError as error:
         refused = str(error)
         report.add(MISSING, "grasp", "", refused)

@@ -1,0 +1,63 @@
+"""Can open hands be at the valve's handles at all? Asked once, before a run, so that the file is blamed by its key."""
+
+import itertools
+import math
+from typing import Protocol
+
+import numpy as np
+
+from valve_drake.behaviors.grasp_geometry import APART
+from valve_drake.checks import ConfigError, require
+from valve_drake.frames import make
+from valve_drake.messages import SIDES
+from valve_drake.valve.valve import Valve
+
+ROOM = 0.3  # so much farther from the axis a hand is looked for that is clear of the valve, for the error's line [m]
+
+
+class AtHandle(Protocol):
+    """What of the valve that turns an open hand touches (CollisionModel.at_handle)."""
+
+    def __call__(self, side: str, X_AG: np.ndarray) -> list[str]: ...
+
+
+def check_handles(at_handle: AtHandle, valve: Valve) -> None:
+    """Raises ConfigError if there are no two handles that open hands can be at: they touch the valve at the others."""
+    count = range(len(valve.handles))
+    free = {side: [k for k in count if any(not at_handle(side, X) for X in _ways(valve, k))] for side in SIDES}
+    if any(math.dist(valve.radius(i), valve.radius(k)) >= APART for i, k in itertools.product(*free.values())):
+        return
+    handle, side = next((k, side) for side in SIDES for k in count if k not in free[side])
+    way = min(_ways(valve, handle), key=lambda X: len(at_handle(side, X)))
+    touched = set(at_handle(side, way))
+    words = f"an open hand there touches the valve ({', '.join(sorted(touched))}) or is nearer than collision.padding"
+    fixed = {name for name in touched if not name.startswith("spoke")}  # spokes reach as far as the rim, wherever it is
+    if not fixed:
+        rule = f"fewer, or farther from valve.handles[{handle}]: {words}"
+        raise ConfigError(f"valve.spokes must be {rule}, got {valve.spokes}")
+    extra = _room(at_handle, side, way, fixed)
+    least = math.ceil(1e3 * (math.hypot(*valve.radius(handle)) + (extra or 0.0))) / 1e3
+    rule = "where a hand fits" if extra is None else f"at least {least:g} m off the axis"
+    require(False, f"valve.handles[{handle}].xyz", f"{rule}: {words}", valve.handles[handle].xyz)
+
+
+def _ways(valve: Valve, handle: int) -> list[np.ndarray]:
+    """The poses X_AG of a hand at a handle."""
+    return [valve.grasp(handle, sign) for sign in (1.0, -1.0)]
+
+
+def _room(at_handle: AtHandle, side: str, X_AG: np.ndarray, touched: set[str]) -> float | None:
+    """How much farther from the axis a hand is clear of these shapes, with the valve as it is [m]; None: nowhere."""
+    outwards = np.array([*X_AG[:2, 3], 0.0]) / math.hypot(*X_AG[:2, 3])
+
+    def touches(extra: float) -> bool:
+        there = make(X_AG[:, :3], X_AG[:, 3] + extra * outwards)
+        return not touched.isdisjoint(at_handle(side, there))
+
+    low, high = 0.0, ROOM
+    if touches(high):
+        return None
+    while high - low > 5e-4:
+        middle = (low + high) / 2
+        low, high = (middle, high) if touches(middle) else (low, middle)
+    return high
