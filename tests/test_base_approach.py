@@ -314,16 +314,16 @@ def test_fine_approach_brakes_for_a_stance_at_the_very_edge_of_the_forbidden_zon
     assert CONFIG.clearance < scene.clear(run.poses) < CONFIG.clearance + 0.02
 
 
+def straight_in(scene, alter):
+    """A fine approach from 1.6 m before the stance, with what the base is told changed by `alter`."""
+    return drive(Mode.FINE_APPROACH, Wheels(place(scene, 0.0, 1.6)), scene, alter=alter)
+
+
 @pytest.mark.parametrize("depth", [0.05, DEPTH, 0.30])
 def test_fine_approach_refuses_a_stance_within_the_clearance(depth):
     """A stance 5 cm too near to the panel. With a short stem panel and stance are nearer to the marker."""
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0), noise=0.0, depth=depth)
-    run = drive(
-        Mode.FINE_APPROACH,
-        Wheels(place(scene, 0.0, 1.6)),
-        scene,
-        alter=lambda t, seen: (*seen[:2], dc.replace(seen[2], base=seen[2].base + [0.15, 0, 0])),
-    )
+    run = straight_in(scene, lambda t, seen: (*seen[:2], dc.replace(seen[2], base=seen[2].base + [0.15, 0, 0])))
     assert (run.status.state, run.status.verdict) == ("failed", Verdict.REACH_LIMIT)
     assert "too near" in run.status.detail
     assert np.max(np.abs(run.twists)) == 0
@@ -331,12 +331,7 @@ def test_fine_approach_refuses_a_stance_within_the_clearance(depth):
 
 def test_fine_approach_without_a_stance_fails_with_its_reason_and_never_moves():
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
-    run = drive(
-        Mode.FINE_APPROACH,
-        Wheels(place(scene, 0.0, 1.6)),
-        scene,
-        alter=lambda t, seen: (*seen[:2], dc.replace(seen[2], found=False, reason="too low")),
-    )
+    run = straight_in(scene, lambda t, seen: (*seen[:2], dc.replace(seen[2], found=False, reason="too low")))
     assert (run.status.state, run.status.verdict, run.status.detail) == ("failed", Verdict.REACH_LIMIT, "too low")
     assert np.max(np.abs(run.twists)) == 0
     assert run.time == pytest.approx(CONFIG.stance_patience, abs=0.1)
@@ -345,35 +340,23 @@ def test_fine_approach_without_a_stance_fails_with_its_reason_and_never_moves():
 def test_fine_approach_waits_for_a_search_that_takes_longer_than_its_patience():
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
     long = CONFIG.stance_patience + 8
-    run = drive(
-        Mode.FINE_APPROACH,
-        Wheels(place(scene, 0.0, 1.6)),
-        scene,
-        alter=lambda t, seen: seen if t > long else (*seen[:2], Stance()),
-    )
+    run = straight_in(scene, lambda t, seen: seen if t > long else (*seen[:2], Stance()))
     assert_arrived(run, scene)
     assert run.time > long
 
 
 def test_fine_approach_does_not_wait_for_a_search_without_a_pose():
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
-    run = drive(
-        Mode.FINE_APPROACH,
-        Wheels(place(scene, 0.0, 1.6)),
-        scene,
-        alter=lambda t, seen: (seen[0], RectangleEstimate(time=t), Stance()),
-    )
+    run = straight_in(scene, lambda t, seen: (seen[0], RectangleEstimate(time=t), Stance()))
     assert (run.status.verdict, run.status.detail) == (Verdict.REACH_LIMIT, "no stance: the marker's pose is not known")
     assert run.time == pytest.approx(CONFIG.stance_patience, abs=0.1)
 
 
 def test_fine_approach_does_not_wait_for_a_marker_that_is_seen_no_more():
     scene = Scene(np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
-    run = drive(
-        Mode.FINE_APPROACH,
-        Wheels(place(scene, 0.0, 1.6)),
+    run = straight_in(
         scene,
-        alter=lambda t, seen: (
+        lambda t, seen: (
             seen[0],
             seen[1] if t < 2.0 else RectangleEstimate(time=t),
             Stance(time=1.0, found=True, base=np.zeros(3)) if t > 1.5 else Stance(),

@@ -12,10 +12,9 @@ from valve_drake.valve.valve import has_heading, heading, turned
 
 AROUND = (0.5, -0.5, 1.0, -1.0)  # sides from which a valve with an upright axis is tried, off the nearest [rad]
 FEW = 9  # distances of a search's first round
-SAME_HEIGHT, SAME_TILT = (
-    0.01,
-    0.03,
-)  # a valve seen off by less needs no other stance; well below a grasp's room [m, rad]
+# A valve that is seen off by less needs no other stance: well below what a grasp leaves room for.
+SAME_HEIGHT = 0.01  # [m]
+SAME_TILT = 0.03  # [rad]
 AS_GOOD = 0.05  # a place whose margin has fallen by less is as good as it was
 
 
