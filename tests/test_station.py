@@ -261,6 +261,15 @@ def test_same_seed_same_image_other_seed_other_noise():
     assert a.data == b.data != c.data
 
 
+def test_noise_lightens_as_much_as_it_darkens_and_is_as_strong_as_asked_for():
+    clean, noisy = (Rig([f"simulation.camera.noise={n}"]).run(0.07).read("head_left.image").image for n in (0, 3))
+    inside = (clean > 20) & (clean < 235)  # nothing is clipped there
+    error = (noisy.astype(float) - clean)[inside]
+    # JPEG rounds a plain wall, all of it to one side, by up to half a level; half of the noise alone has a mean of 1.2.
+    assert inside.mean() > 0.5 and abs(error.mean()) < 0.5
+    assert error.std() == pytest.approx(3.0, rel=0.1)
+
+
 def test_start_pose_puts_the_robot_at_its_distance_bearing_and_heading():
     valve = ValveConfig(height=1.0, yaw=0.4)
     x, y, heading = start_pose(StartConfig(distance=3.0, bearing=0.5, heading=0.2), valve)
