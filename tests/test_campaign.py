@@ -680,6 +680,14 @@ def test_the_report_holds_the_verdict_against_the_truth(tmp_path, fake):
     assert found["false_turned_interval_95"] == pytest.approx([0.0084, 0.9057], abs=1e-3)
     page = report.page(records, tmp_path)
     assert "<b>1 + 1</b>" in page and "seed 6: false turned" in page and "seed 7: false failure" in page
+    assert "could not say" not in page
+    records[1]["verdict"] = "unverified"  # neither turned nor not turned is claimed
+    assert counts() == (2, 1, 0, [6])
+    found = campaign.summary(records)["verdicts_against_truth"]
+    assert (found["unverified"], found["unverified_but_turned"]) == (1, 1)
+    page = report.page(records, tmp_path)
+    assert "1 <code>unverified</code> besides: the camera could not say. 1 of these valves" in page
+    assert "could not say" in report.page(records[1:2], tmp_path)
 
 
 def test_records_and_page_have_contact_honesty_collisions_and_the_estimators_consistency(tmp_path, fake):

@@ -30,6 +30,7 @@ from valve_drake.campaign.statistics import interval
 from valve_drake.campaign.trial import Record, Trial, files_of, perform, turned
 from valve_drake.checks import ConfigError, OperationFailed, is_number, require, shown
 from valve_drake.config import Uniform
+from valve_drake.messages import Verdict
 from valve_drake.versions import versions
 
 PLAN, RECORDS, LOGS = "campaign.json", "records", "logs"
@@ -396,18 +397,23 @@ def least_honesty(record: Record) -> float | None:
 
 def false_verdicts(records: Sequence[Record], tolerance: float = math.radians(3.0)) -> dict[str, Any]:
     """The verdict against the truth: `turned` though the valve is not where it should be, and the other way round, with
-    the interval of the rate of each.
+    the interval of the rate of each. `unverified` claims neither: such runs are counted apart, with how many of their
+    valves are where they should be.
 
     tolerance: of the angle, the camera's tolerance and its error together.
     """
     known, false = 0, {"turned": 0, "failure": 0}
+    unverified: list[bool] = []
     seeds: list[list[Any]] = []
     for r in records:
         asked, true = r.get("valve_angle_command_rad"), r.get("valve_angle_true_rad")
         if asked is None or true is None:
             continue
-        known += 1
         there = abs(true - asked) <= tolerance
+        if r["verdict"] == Verdict.UNVERIFIED:
+            unverified.append(there)
+            continue
+        known += 1
         kind = "turned" if turned(r) and not there else "failure" if r["outcome"] == "failed" and there else ""
         if kind:
             false[kind] += 1
@@ -418,6 +424,8 @@ def false_verdicts(records: Sequence[Record], tolerance: float = math.radians(3.
         "false_turned_interval_95": list(interval(false["turned"], known)),
         "false_failure": false["failure"],
         "false_failure_interval_95": list(interval(false["failure"], known)),
+        "unverified": len(unverified),
+        "unverified_but_turned": sum(unverified),
         "seeds": seeds,
     }
 
