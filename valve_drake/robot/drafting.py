@@ -8,6 +8,7 @@ Lengths [m], angles [rad].
 import dataclasses as dc
 import math
 import re
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
@@ -15,6 +16,13 @@ import numpy as np
 from valve_drake.robot.urdf import Joint, Robot, rotation
 
 LEAST_ARM = 4  # joints of a chain that is taken for an arm
+SERVES = 5  # joints that an arm of a run has at least
+SIDES_APART = 0.05  # between the beginnings of two arms that names do not tell apart [m]
+ABOVE = 0.15  # the shoulders: where an eye may be mounted on a robot without a head [m]
+LEAST_FOOTPRINT = 0.05  # that a robot.yaml may have [m]
+SPEED_SHARE = 0.6  # of a joint's velocity limit
+LEAST_OPEN = 0.01  # that a robot.yaml may have [m]
+MOST_OPEN = 0.085  # of which a draft makes use [m]
 SNAP = math.radians(15)  # a grip's axis this near to an axis of its link is that axis
 PAD_LENGTH = 0.02  # of a pad's surface; half of it on either side of its middle [m]
 _OPTICAL = (-math.pi / 2, 0.0, -math.pi / 2)  # roll, pitch, yaw from x forward, z up to z forward, x to the right
@@ -22,6 +30,7 @@ STIFFNESS_PER_EFFORT = 130.0  # a joint's stiffness [N m/rad] for each N m of it
 NOISE_PER_EFFORT = 0.005  # a guess at what a joint's torque reads off by, as a share of its limit
 Ask = Callable[[str], str]  # notes what is to be done -> the comment that says it
 Boxes = Mapping[str, np.ndarray]  # link -> (2, 3) least and greatest corner of its shapes in its own frame [m]
+Points = Mapping[str, np.ndarray]  # link -> (n, 3) corners of its shapes' faces, in its own frame [m]
 
 _SIDE = re.compile(
     r"left|right|Left|Right|LEFT|RIGHT|(?<![A-Za-z0-9])[lrLR](?![A-Za-z0-9])|^[lrLR](?=[aA]rm|ARM)|^[LR](?=[A-Z][a-z])"
@@ -31,6 +40,7 @@ _OTHER |= {right: left for left, right in _OTHER.items()}
 _FINGER = re.compile(r"grip|finger|thumb|jaw|knuckle|hand", re.IGNORECASE)
 _LEG = re.compile(r"(?<![a-z])(hip|leg|thigh|knee|calf|ankle|foot)(?![a-z])|_(hip|leg)_", re.IGNORECASE)
 _CAMERA = re.compile(r"camera|(?<![a-z])cam(?![a-z])|optical|stereo|(?<![a-z])eye|zed|realsense|kinect", re.IGNORECASE)
+_HEAD = re.compile(r"head|neck", re.IGNORECASE)
 _MOUNT = re.compile(r"screw|mount|base", re.IGNORECASE)
 _FORCE = re.compile(r"(?<![a-z])ft(?![a-z])|force|torque|wrench|sensor", re.IGNORECASE)
 _WHEEL = re.compile(r"wheel|caster", re.IGNORECASE)
@@ -58,7 +68,7 @@ class Hand:
     driver: str | None = None
     more_drivers: tuple[str, ...] = ()
     pads: tuple[str, ...] = ()
-    opening: float = 0.0
+    opening: float = 0.0  # what the fingers open to; 0: not told
     grip: tuple[str, np.ndarray, np.ndarray] | None = None  # link, xyz, rpy
     camera: str | None = None
     pad_at: np.ndarray | None = None  # in the first pad's link
@@ -81,19 +91,24 @@ class Guess:
     cameras: dict[str, str]
     turned: list[str]
     second_eye: str | None
+    eye: tuple[str, np.ndarray, np.ndarray] | None  # where one may be mounted if there is none: link, xyz, rpy
     weld: list[str]
+    carrying: list[str]  # of `weld`: those between the base and both arms
+    by_place: bool  # the arms are told by where they are, and not by their names
     colors: list[str]
 
 
-def guess(robot: Robot, boxes: Boxes, colors: Mapping[str, tuple[float, ...]], words: Iterable[str]) -> Guess:
+def guess(
+    robot: Robot, boxes: Boxes, points: Points, colors: Mapping[str, tuple[float, ...]], words: Iterable[str]
+) -> Guess:
     """colors: the materials of the model, r, g, b, a in 0..1. words: names of links and meshes: they tell the drive."""
     arms = find_arms(robot)
     poses = robot.poses()
     common = _common(robot, arms)
     lift = [j.name for j in common if j.type == "prismatic" and abs(_axis(j, poses)[2]) > 0.9]
     waists = [j.name for j in common if j.type != "prismatic" and abs(_axis(j, poses)[2]) > 0.9]
-    pan, tilt, eye, second = _head(robot, arms, common, poses)
-    hands = {side: _hand(robot, joints, boxes) for side, joints in arms.items()}
+    pan, tilt, eye, second, top = _head(robot, arms, common, poses)
+    hands = {side: _hand(robot, joints, boxes, points) for side, joints in arms.items()}
     cameras, turned = _cameras(robot, eye, hands, poses)
     named = {*lift, *waists[:1], *(j for arm in arms.values() for j in arm), pan, tilt}
     named |= {hand.driver for hand in hands.values()}
@@ -116,7 +131,10 @@ def guess(robot: Robot, boxes: Boxes, colors: Mapping[str, tuple[float, ...]], w
         cameras=cameras,
         turned=turned,
         second_eye=second,
+        eye=_mounted(robot, arms, top, boxes, poses) if eye is None else None,
         weld=weld,
+        carrying=[joint.name for joint in common if joint.name in weld],
+        by_place=bool(arms) and mirrored(arms["left"][0]) != arms["right"][0],
         colors=[name for name, rgba in colors.items() if _as_the_marks(rgba)],
     )
 
@@ -138,30 +156,56 @@ def _next(robot: Robot, link: str) -> list[Joint]:
 
 
 def find_arms(robot: Robot) -> dict[str, list[str]]:
-    """`left` and `right`: the joints of the longest two chains of the same names but for the side; or nothing."""
-    best: list[str] = []
+    """`left` and `right`: the joints of the two longest chains that begin with the same name but for the side.
+
+    If names tell of none, the two longest that begin at the same place but for the side; or nothing.
+    """
+    best: tuple[list[str], list[str]] = [], []
     for joint in robot.joints.values():
         twin = robot.joints.get(mirrored(joint.name))
-        if (
-            not joint.moving
-            or _LEG.search(joint.name)
-            or side_of(joint.name) != "left"
-            or twin is None
-            or not twin.moving
-        ):
-            continue
-        chain, current = [joint.name], joint
-        while len(following := _next(robot, current.child)) == 1:
-            current = following[0]
-            last = _FINGER.search(current.name) and len(_next(robot, current.child)) < 2  # a jaw, and no wrist
-            if current.type == "prismatic" or current.mimic or last or mirrored(current.name) not in robot.joints:
-                break
-            chain.append(current.name)
-        if len(chain) > len(best):
-            best = chain
-    if len(best) < LEAST_ARM:
-        return {}
-    return {"left": best, "right": [mirrored(name) for name in best]}
+        if _begins(joint) and side_of(joint.name) == "left" and twin is not None and twin.moving:
+            pair = _chain(robot, joint), _chain(robot, twin)
+            if min(map(len, pair)) > min(map(len, best)):
+                best = pair
+    if min(map(len, best)) < LEAST_ARM:
+        best = _arms_by_place(robot)
+    return dict(zip(("left", "right"), best)) if min(map(len, best)) >= LEAST_ARM else {}
+
+
+def _begins(joint: Joint) -> bool:
+    return joint.moving and not _LEG.search(joint.name)
+
+
+def _chain(robot: Robot, joint: Joint) -> list[str]:
+    """A joint and those that follow it one by one, up to a hand."""
+    chain, current = [joint.name], joint
+    while len(following := _next(robot, current.child)) == 1:
+        current = following[0]
+        last = _FINGER.search(current.name) and len(_next(robot, current.child)) < 2  # a jaw, and no wrist
+        if current.type == "prismatic" or current.mimic or last:
+            break
+        chain.append(current.name)
+    return chain
+
+
+def _arms_by_place(robot: Robot) -> tuple[list[str], list[str]]:
+    """The longest two chains whose beginnings are mirror images of each other; of several, those in front."""
+    poses = robot.poses()
+    found: list[tuple[list[str], np.ndarray]] = []
+    for joint in robot.joints.values():
+        chain = _chain(robot, joint) if _begins(joint) else []
+        if len(chain) >= LEAST_ARM:
+            inner = {name for other, _ in found for name in other}
+            found = [(other, place) for other, place in found if other[0] not in chain]
+            if joint.name not in inner:
+                found.append((chain, poses[joint.child][:3, 3]))
+    pairs = []
+    for left, p in found:
+        for right, r in found:
+            off = float(np.linalg.norm(p - r * [1, -1, 1]))
+            if p[1] - r[1] > SIDES_APART and off < (p[1] - r[1]) / 2:
+                pairs.append((min(len(left), len(right)), round(float(p[0]), 3), -off, left, right))
+    return max(pairs)[3:] if pairs else ([], [])
 
 
 def _common(robot: Robot, arms: Mapping[str, list[str]]) -> list[Joint]:
@@ -174,8 +218,8 @@ def _common(robot: Robot, arms: Mapping[str, list[str]]) -> list[Joint]:
 
 def _head(
     robot: Robot, arms: Mapping[str, list[str]], common: list[Joint], poses: Mapping[str, np.ndarray]
-) -> tuple[str | None, str | None, str | None, str | None]:
-    """Pan, tilt, the left eye's frame, the right eye's."""
+) -> tuple[str | None, str | None, str | None, str | None, str | None]:
+    """Pan, tilt, the left eye's frame, the right eye's, and the head's last link."""
     limbs = {link for arm in arms.values() for link in robot.beyond(robot.joints[arm[0]].child)}
     carried = {joint.name for joint in common}
 
@@ -184,7 +228,10 @@ def _head(
 
     seen = [link for link in robot.links if _CAMERA.search(link) and link not in limbs]
     eyes = [link for link in seen if own(link)] or [link for link in seen if "head" in link.lower()]
-    heads = [link for link in robot.links if link not in limbs and "head" in link.lower() and own(link)]
+    others = [link for link in robot.links if link not in limbs and own(link)]
+    heads = [link for link in others if _HEAD.search(link) or any(_HEAD.search(joint.name) for joint in own(link))]
+    if not heads and arms:
+        heads = _above_the_arms(robot, arms, others, own, poses)
     eyes.sort(
         key=lambda link: (
             side_of(link) != "left",
@@ -206,10 +253,49 @@ def _head(
             tilt = joint.name
     eye = eyes[0] if eyes else None
     second = mirrored(eye) if eye and mirrored(eye) != eye and mirrored(eye) in robot.links else None
-    return pan, tilt, eye, second
+    return pan, tilt, eye, second, top
 
 
-def _hand(robot: Robot, arm: list[str], boxes: Boxes) -> Hand:
+def _above_the_arms(
+    robot: Robot,
+    arms: Mapping[str, list[str]],
+    links: Iterable[str],
+    own: Callable[[str], list[Joint]],
+    poses: Mapping[str, np.ndarray],
+) -> list[str]:
+    """Links that stand for a head which is not called one: above the shoulders, turned by one to three joints."""
+    shoulders = min(poses[robot.joints[arm[0]].child][2, 3] for arm in arms.values())
+    legs = (_LEG, _WHEEL, _FINGER)
+
+    def turns(joint: Joint) -> bool:
+        return joint.type != "prismatic" and not any(kind.search(joint.name + " " + joint.child) for kind in legs)
+
+    return [
+        link for link in links if poses[link][2, 3] > shoulders and len(own(link)) <= 3 and all(map(turns, own(link)))
+    ]
+
+
+def _mounted(
+    robot: Robot, arms: Mapping[str, list[str]], top: str | None, boxes: Boxes, poses: Mapping[str, np.ndarray]
+) -> tuple[str, np.ndarray, np.ndarray] | None:
+    """Where an eye may be mounted, looking ahead: on the front of the head, else above the middle of the shoulders."""
+    if top is not None:
+        box = corners_in(poses[top], boxes[top]) if top in boxes else poses[top][None, :3, 3]
+        low, high = box.min(axis=0), box.max(axis=0)
+        link, at = top, np.array([high[0] + 0.01, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2])
+    elif arms:
+        first = [robot.joints[arm[0]] for arm in arms.values()]
+        paths = [[robot.root, *(joint.child for joint in robot.path(joint.parent))] for joint in first]
+        link = [a for a, b in zip(*paths) if a == b][-1]
+        at = np.mean([poses[joint.child][:3, 3] for joint in first], axis=0) + [0, 0, ABOVE]
+    else:
+        return None
+    X = np.linalg.inv(poses[link])
+    rpy = _rpy(X[:3, :3] @ rotation(np.array(_OPTICAL)))
+    return link, np.round((X @ np.append(at, 1.0))[:3], 3) + 0.0, np.round(rpy, 4) + 0.0
+
+
+def _hand(robot: Robot, arm: list[str], boxes: Boxes, points: Points) -> Hand:
     wrist = robot.joints[arm[-1]].child
     hand = Hand(wrist)
     beyond = robot.beyond(wrist)
@@ -236,11 +322,49 @@ def _hand(robot: Robot, arm: list[str], boxes: Boxes) -> Hand:
     hand.sensor = told[0] if told else rigid[0].name if rigid else None
     palm = robot.joints[hand.sensor].child if hand.sensor else wrist
     if hand.driver and hand.pads:
-        _grip(robot, hand, palm, boxes)
+        _grip(robot, hand, palm, boxes, points)
     return hand
 
 
-def _grip(robot: Robot, hand: Hand, palm: str, boxes: Boxes) -> None:
+def couple_fingers(robot: Robot) -> list[str]:
+    """Makes the second of two fingers of a hand follow the first, if they are mirror images -> a line for each.
+
+    A gripper of a run has one motor; a file whose fingers both have one, as simulators like it, says how they close
+    together by their places, axes and ranges.
+    """
+    lines = []
+    for arm in find_arms(robot).values():
+        beyond = robot.beyond(robot.joints[arm[-1]].child)
+        both = [j for j in robot.joints.values() if j.moving and j.parent in beyond]
+        if len(both) != 2 or any(j.mimic for j in both) or both[0].type != both[1].type:
+            continue
+        first, second = both
+        scale = _mirrors(robot, first, second)
+        if scale is None:
+            continue
+        ET.SubElement(second.element, "mimic", {"joint": first.name, "multiplier": f"{scale:g}"})
+        for part in robot.element.findall("transmission"):
+            driven = part.find("joint")
+            if driven is not None and driven.get("name") == second.name:
+                robot.element.remove(part)
+        lines.append(
+            f"joint '{second.name}': follows '{first.name}' by {scale:g}: its finger is that one's mirror image"
+        )
+    return lines
+
+
+def _mirrors(robot: Robot, first: Joint, second: Joint) -> float | None:
+    """1 or -1: how the second finger's joint follows the first one's for both to close alike; None: they do not."""
+    low, high = first.range
+    poses = robot.poses()
+    for scale in (-1.0, 1.0):
+        alike = math.isfinite(low + high) and np.allclose(sorted((scale * low, scale * high)), second.range, atol=1e-3)
+        if alike and np.linalg.norm(_axis(first, poses) + scale * _axis(second, poses)) < 0.05:
+            return scale
+    return None
+
+
+def _grip(robot: Robot, hand: Hand, palm: str, boxes: Boxes, points: Points) -> None:
     """The grip between the pads (z the approach, y the closing direction), their surface, and the opening."""
     assert hand.driver is not None
     a, b = hand.pads
@@ -252,37 +376,58 @@ def _grip(robot: Robot, hand: Hand, palm: str, boxes: Boxes) -> None:
         X = np.linalg.inv(poses[palm])
         found.append((X @ poses[a], X @ poses[b]))
     middles = [[(X @ np.append(boxes[pad].mean(axis=0), 1.0))[:3] for X, pad in zip(pair, (a, b))] for pair in found]
-    gaps = [float(np.linalg.norm(p - r)) for p, r in middles]
-    shut, open_ = (0, 1) if gaps[0] < gaps[1] else (1, 0)
-    middle = (middles[shut][0] + middles[shut][1]) / 2
-    y = middles[open_][0] - middles[open_][1]
+    y = middles[1][0] - middles[1][1] - (middles[0][0] - middles[0][1])  # how the first pad leaves the other
+    middle = (middles[0][0] + middles[0][1]) / 2
+    if np.linalg.norm(y) < 1e-3:
+        return
     z = middle - (middle @ y) / (y @ y) * y
-    if np.linalg.norm(y) < 1e-3 or np.linalg.norm(z) < 1e-3:
+    if np.linalg.norm(z) < 1e-3:
         return
     y, z = _snapped(y), _snapped(z)
     z = z - (z @ y) * y
     z /= np.linalg.norm(z)
-    hand.pad_at, hand.pad_size = _surface(boxes[a], found[shut][0][:3, :3].T @ np.stack([y, z], axis=1))
+    ends = [[_end(X, points.get(pad), boxes[pad], z) for X, pad in zip(pair, (a, b))] for pair in found]
+    gaps = [float((p - r) @ y) for p, r in ends]
+    shut, open_ = (0, 1) if abs(gaps[0]) < abs(gaps[1]) else (1, 0)
+    y = y * np.sign(gaps[open_])
+    middle = (middles[shut][0] + middles[shut][1]) / 2
+    axes = np.stack([y, z], axis=1)
+    hand.pad_at, hand.pad_size = _surface(boxes[a], points.get(a), found[shut][0][:3, :3].T @ axes)
+    other, _ = _surface(boxes[b], points.get(b), found[shut][1][:3, :3].T @ (axes * [-1, 1]))
     surface = [(pair[0] @ np.append(hand.pad_at, 1.0))[:3] for pair in found]
-    xyz = middle + ((surface[shut] - middle) @ z) * z
-    hand.opening = math.floor(2e3 * float((surface[open_] - xyz) @ y)) / 1e3
+    opposite = (found[shut][1] @ np.append(other, 1.0))[:3]
+    xyz = middle + ((surface[shut] - middle) @ z) * z + (((surface[shut] + opposite) / 2 - middle) @ y) * y
+    hand.opening = math.floor(2e3 * float((surface[open_] - xyz) @ y) + 1e-6) / 1e3
     R = np.stack([np.cross(y, z), y, z], axis=1)
     hand.grip = palm, np.round(xyz, 3) + 0.0, np.round(_rpy(R), 4) + 0.0
 
 
-def _surface(box: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _end(X: np.ndarray, points: np.ndarray | None, box: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The middle of what is near the end of a finger whose link is at X, along the approach z (3,)."""
+    corners = corners_in(X, box) if points is None else points @ X[:3, :3].T + X[:3, 3]
+    along = corners @ z
+    near = corners[along > along.max() - 2 * PAD_LENGTH]
+    return np.mean([near.min(axis=0), near.max(axis=0)], axis=0)
+
+
+def _surface(box: np.ndarray, points: np.ndarray | None, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Middle and size (along the bar, along the approach) of the gripping surface of a pad, near its end.
 
-    axes: (3, 2) the closing direction, from the other pad to this, and the approach, in the pad's link.
+    points: corners of the pad's shapes (n, 3): those near its end tell where the surface is, since a finger may be
+    crooked. axes: (3, 2) the closing direction, from the other pad to this, and the approach. All in the pad's link.
     """
-    at = box.mean(axis=0)
     close = int(np.argmax(np.abs(axes[:, 0])))
     reach = max((k for k in range(3) if k != close), key=lambda k: abs(axes[k, 1]))
     width = 3 - close - reach
-    at[close] = box[0 if axes[close, 0] > 0 else 1, close]
     length = float(np.ptp(box[:, reach]))
+    end = box[1, reach] if axes[reach, 1] > 0 else box[0, reach]
+    if points is not None:
+        near = points[np.abs(points[:, reach] - end) <= 2 * PAD_LENGTH]
+        if len(near) >= 4 and min(np.ptp(near[:, close]), np.ptp(near[:, width])) > 1e-3:
+            box = np.stack([near.min(axis=0), near.max(axis=0)])
+    at = box.mean(axis=0)
+    at[close] = box[0 if axes[close, 0] > 0 else 1, close]
     if length > 2 * PAD_LENGTH:  # a long finger holds with its end
-        end = box[1, reach] if axes[reach, 1] > 0 else box[0, reach]
         at[reach] = end - np.sign(axes[reach, 1]) * PAD_LENGTH
     size = np.array([min(PAD_LENGTH, float(np.ptp(box[:, width])) / 2), min(0.8 * PAD_LENGTH, length / 2)])
     return np.round(at, 4) + 0.0, np.round(size, 4)
@@ -342,14 +487,22 @@ def draft(robot: Robot, found: Guess, model: str, mends: Iterable[str]) -> tuple
     if found.weld:
         lines += _list("weld", found.weld)
         lines.append(ask("weld: these joints are in no group below and are held at zero. Is any of them needed?"))
+        if found.carrying:
+            names = ", ".join(found.carrying)
+            lines.append(
+                ask(f"lift: {names}: below both arms: those that are not to stand at zero belong in lift.joints")
+            )
     lines.append(
         "counterbalanced: false  " + ask("counterbalanced: true if springs carry the arms, and not their motors")
     )
+    footprint = "# half length, half width of the shapes [m]"
+    if min(found.footprint) < LEAST_FOOTPRINT:
+        footprint = ask("base.footprint: half length, half width [m]: the base has no shape in the model")
     lines += [
         "base:",
         f"  frame: {_key(found.base)}",
         f"  drive: {found.drive}  " + ask("base.drive: holonomic, differential or fixed: from the wheels' names"),
-        f"  footprint: [{found.footprint[0]:g}, {found.footprint[1]:g}]  # half length, half width of the shapes [m]",
+        "  footprint: " + _flow(max(half, LEAST_FOOTPRINT) for half in found.footprint) + "  " + footprint,
     ]
     if found.drive != "fixed":
         sideways = [0.5] if found.drive == "holonomic" else []
@@ -398,7 +551,12 @@ def _arm_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
             "# arms: " + ask(f"arms: no two chains of {LEAST_ARM} joints with names that differ by left and right")[2:],
         ]
     lines = ["arms:"]
+    if found.by_place:
+        lines.append(ask("arms: told by where they are, since their names differ by more than left and right"))
+    alike = len({len(names) for names in found.arms.values()}) == 1
     for side, names in found.arms.items():
+        if len(names) < SERVES:
+            lines.append(ask(f"arms.{side}.joints: a run needs {SERVES} joints or more, these are {len(names)}"))
         joints = [robot.joints[name] for name in names]
         home = [_home(joint) for joint in joints]
         efforts = [joint.limit("effort") or 0.0 for joint in joints]
@@ -411,6 +569,8 @@ def _arm_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
             f"    work: {_flow(home)}  " + say("arms.*.work: the arm at the valve, elbow where it should be"),
             f"    stiffness: {_flow(stiffness)}  # {STIFFNESS_PER_EFFORT:g} times the effort limits",
         ]
+        if not alike:
+            lines.append(f"    speed: {_flow(_speeds([joint] for joint in joints))}  # {SPEED_SHARE:g} of its limits")
         weak = [name for name, effort in zip(names, efforts) if not effort]
         if weak:
             lines.append("    " + ask(f"arms.{side}: no effort limit in the model, so no actuator: {', '.join(weak)}"))
@@ -424,12 +584,17 @@ def _arm_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
             lines.append(
                 f"    sensor: {_key(sensor)}  " + say("arms.*.sensor: the fixed joint in which forces are measured")
             )
-    fast = []
-    for k in range(len(found.arms["left"])):
-        limits = [robot.joints[arm[k]].limit("velocity") or 1.0 for arm in found.arms.values()]
-        fast.append(round(min(0.6 * min(limits), 2.0), 2))
-    lines.append(f"arm_speed: {_flow(fast)}  # 0.6 of the velocity limits, 2 rad/s at most")
+    if alike:
+        pairs = zip(*([robot.joints[name] for name in names] for names in found.arms.values()))
+        lines.append(f"arm_speed: {_flow(_speeds(pairs))}  # {SPEED_SHARE:g} of the velocity limits, 2 rad/s at most")
     return lines
+
+
+def _speeds(groups: Iterable[Iterable[Joint]]) -> list[float]:
+    """What the slowest of each group's joints may do [rad/s]."""
+    return [
+        round(min(2.0, *(SPEED_SHARE * (joint.limit("velocity") or 1.0) for joint in group)), 2) for group in groups
+    ]
 
 
 def _gripper_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
@@ -438,7 +603,8 @@ def _gripper_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
     lines = ["grippers:"]
     for side, hand in found.hands.items():
         if hand.driver is None:
-            lines.append(f"  # {side}: " + ask(f"grippers.{side}: no moving joint beyond the arm")[2:])
+            what = f"no moving joint beyond the arm: a run needs a gripper, so add one to the URDF (link {hand.link})"
+            lines.append(f"  # {side}: " + ask(f"grippers.{side}: {what}")[2:])
             continue
         pads = _flow(hand.pads) if hand.pads else "[]  " + ask(f"grippers.{side}.pads: two links that close on the bar")
         lines += [f"  {side}:", f"    joint: {_key(hand.driver)}", f"    pads: {pads}"]
@@ -447,10 +613,15 @@ def _gripper_lines(robot: Robot, found: Guess, ask: Ask) -> list[str]:
         elif hand.more_drivers:
             rest = ", ".join(hand.more_drivers)
             lines[-2] += "  " + ask(f"grippers.{side}: {rest} do not follow it: give them a <mimic>, or weld them")
+    if all(hand.driver is None for hand in found.hands.values()):
+        lines[0] = "# grippers:"
     opening = min((hand.opening for hand in found.hands.values()), default=0.0)
-    lines += [
-        f"opening: {opening:g}  " + ask("opening: between the open pads' surfaces [m], from the shapes' boxes"),
-    ]
+    used = min(opening, MOST_OPEN)
+    if used < LEAST_OPEN:
+        lines.append("# " + ask("opening: between the open pads' surfaces [m]: the shapes do not tell it")[2:])
+    else:
+        of = f", of {opening:g}" if used < opening else ""
+        lines.append(f"opening: {used:g}  " + ask(f"opening: between the open pads' surfaces [m]{of}, from the shapes"))
     shaped = next((hand for hand in found.hands.values() if hand.pad_at is not None), None)
     say = ask("pad: the middle of the gripping surface in the first pad's link [m], its size [m], from its box")
     if shaped is not None and shaped.pad_at is not None and shaped.pad_size is not None:
@@ -468,6 +639,10 @@ def _frame_lines(found: Guess, ask: Ask) -> list[str]:
         link = found.cameras[key]
         note = ask(f"frames.{key}_camera: {link} looks along its x, as ROS has it: z must look, x to the right")
         frames.append(f"  {key}_camera: {{link: {_key(link)}, rpy: {_flow(_OPTICAL)}}}  {note}")
+    if found.eye is not None:
+        link, xyz, rpy = found.eye
+        note = ask("frames.left_eye: a place for the left camera of a stereo head, since the model has none; z looks")
+        frames.append(f"  left_eye: {{link: {_key(link)}, xyz: {_flow(xyz)}, rpy: {_flow(rpy)}}}  {note}")
     lines = []
     if found.arms and not grips:
         lines.append("# " + ask("frames: left_grip, right_grip {link, xyz, rpy}: no two pads were found")[2:])
@@ -475,15 +650,19 @@ def _frame_lines(found: Guess, ask: Ask) -> list[str]:
         lines += ["frames:", *frames]
     if grips:
         lines.insert(-len(frames), ask("frames: the grips between the pads: z the approach, y the closing direction"))
-    if found.cameras:
-        names = {key: f"{key}_camera" if key in found.turned else link for key, link in found.cameras.items()}
+    names = {key: f"{key}_camera" if key in found.turned else link for key, link in found.cameras.items()}
+    if found.eye is not None:
+        names = {"head_left": "left_eye", **names}
+    if names:
         lines.append(f"cameras: {{{', '.join(f'{key}: {_key(name)}' for key, name in names.items())}}}")
-    if "head_left" not in found.cameras:
+    if "head_left" not in names:
         lines.append(ask("cameras.head_left: no camera's frame was found on the head: z forward, x to the right"))
     elif found.second_eye is None:
         lines.append(ask("cameras: no second eye in the model: the valve is found with two"))
-    if any(f"{side}_wrist" not in found.cameras for side in found.arms):
-        lines.append(ask("cameras.*_wrist: no camera beyond the arms' last joints: mount them, or servo: none"))
+    if found.arms and any(f"{side}_wrist" not in found.cameras for side in found.arms):
+        lines.append(
+            "servo: none  " + ask("servo: camera, with cameras.*_wrist beyond the arms' last joints: it has none")
+        )
     return lines
 
 

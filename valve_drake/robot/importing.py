@@ -23,6 +23,7 @@ from valve_drake.robot.urdf import Joint, Robot
 
 GREY: Rgba = (0.7, 0.7, 0.7, 1.0)  # of shapes without a colour
 FLOOR = 0.02  # how far below or above the floor the lowest shape may lie [m]; more, and a base_footprint is added
+MOST_LOST = 4  # missing files, after the first, that a line names
 FOOTPRINT = "base_footprint"
 _Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # glTF's axes to a robot's
 
@@ -97,7 +98,8 @@ def import_robot(model: str, out: Path | None = None, overwrite: bool = False, p
     converter.convert()
     notes = converter.notes
     notes += _on_the_floor(robot, converter.boxes)
-    found = drafting.guess(robot, converter.boxes, converter.used, words)
+    mended += drafting.couple_fingers(robot)
+    found = drafting.guess(robot, converter.boxes, converter.points, converter.used, words)
     text, todo = drafting.draft(robot, found, f"{name}.urdf", mended)
     keep = (folder / "robot.yaml").exists() and not overwrite
     if keep:
@@ -163,9 +165,11 @@ class _Converter:
         self._robot, self._folder = robot, path.parent
         self.files: dict[str, str] = {}
         self.boxes: dict[str, np.ndarray] = {}  # link -> (2, 3) of its shapes, see drafting.Boxes
+        self.points: dict[str, np.ndarray] = {}  # link -> (n, 3), see drafting.Points
         self.notes: list[str] = []
         self.used: dict[str, Rgba] = {}  # materials
         self.faces = self.hulls = self.hull_points = 0
+        self._paths: dict[str, Path] = {}
         self._surfaces: dict[Path, Surface] = {}
         self._made: dict[tuple[object, ...], list[tuple[str, Part]]] = {}
         self._colors = self._materials()
@@ -181,7 +185,7 @@ class _Converter:
         for name, link in self._robot.links.items():
             corners = [self._convert(name, link, shape, shape.tag == "visual") for shape in list(self._shapes(link))]
             if corners:
-                points = np.concatenate(corners)
+                self.points[name] = points = np.concatenate(corners)
                 self.boxes[name] = np.stack([points.min(axis=0), points.max(axis=0)])
         for element in self._robot.element.findall("material"):
             self._robot.element.remove(element)
@@ -195,7 +199,8 @@ class _Converter:
             yield from link.findall(tag)
 
     def _load(self) -> None:
-        """Reads every mesh once, so that one that is missing is told before any is converted."""
+        """Reads every mesh once, so that those that are missing are told before any is converted."""
+        self._find()
         for name, link in self._robot.links.items():
             for shape in self._shapes(link):
                 mesh = shape.find("geometry/mesh")
@@ -215,6 +220,25 @@ class _Converter:
                 if shape.tag == "visual":
                     self.notes += [f"mesh {path.name}: {note}" for note in surface.notes]
 
+    def _find(self) -> None:
+        """Raises ConfigError: the first mesh that is missing, and the names of the others."""
+        first: ConfigError | None = None
+        lost: dict[str, None] = {}
+        for name, link in self._robot.links.items():
+            for shape in self._shapes(link):
+                if (mesh := shape.find("geometry/mesh")) is None:
+                    continue
+                try:
+                    self._path(name, mesh)
+                except ConfigError as error:
+                    first = first or error
+                    lost[mesh.get("filename", "")] = None
+        if first is None:
+            return
+        others = list(lost)[1:]
+        more = f"; and {len(others)} more: {', '.join(others[:MOST_LOST])}" if others else ""
+        raise ConfigError(f"{first}{more}{', ...' if len(others) > MOST_LOST else ''}")
+
     def _where(self, link: str) -> str:
         return f"{self._robot.source}: link {shown(link)}"
 
@@ -222,7 +246,11 @@ class _Converter:
         url = mesh.get("filename", "")
         if not url:
             raise ConfigError(f"{self._where(link)}: a <mesh> has no filename")
-        return packages.resolve(url, self._folder, self._where(link)).resolve()
+        if url not in self._paths:
+            self._paths[url], note = packages.resolve_nearby(url, self._folder, self._where(link))
+            if note and note not in self.notes:
+                self.notes.append(note)
+        return self._paths[url]
 
     def _scale(self, mesh: ET.Element) -> np.ndarray:
         return urdf.numbers(mesh, "scale", 3, (1.0, 1.0, 1.0))
@@ -420,7 +448,8 @@ def _on_the_floor(robot: Robot, boxes: dict[str, np.ndarray]) -> list[str]:
     name = FOOTPRINT + "_joint"
     robot.joints = {name: Joint(joint, name, "fixed", FOOTPRINT, robot.root), **robot.joints}
     old, robot.root = robot.root, FOOTPRINT
-    return [f"link '{FOOTPRINT}' is added, {-lowest:.3f} m below {shown(old)}: there is the lowest shape"]
+    way = "below" if lowest < 0 else "above"
+    return [f"link '{FOOTPRINT}' is added, {abs(lowest):.3f} m {way} {shown(old)}: there is the lowest shape"]
 
 
 def _xml(robot: Robot, path: Path, converter: _Converter) -> str:

@@ -59,6 +59,24 @@ def resolve(url: str, beside: Path | None, what: str) -> Path:
     )
 
 
+def resolve_nearby(url: str, beside: Path, what: str) -> tuple[Path, str]:
+    """The file that a URL or path names, and a line to say where its package is nowhere: a folder above the file that
+    names it, and has such a file, is taken for one that was renamed. Raises ConfigError as `resolve` does."""
+    try:
+        return resolve(url, beside, what).resolve(), ""
+    except ConfigError:
+        scheme, _, rest = url.partition("://")
+        name, _, inside = unquote(rest).lstrip("/").partition("/")
+        if scheme not in ("package", "model") or not inside or any(packages(name, beside)):
+            raise
+        folder = beside.resolve()
+        for one in [folder, *folder.parents][:MAX_ABOVE]:
+            if _is_file(one / inside):
+                words = f"package {shown(name)} is nowhere: its files are taken from {shown(one.name)}, which has them"
+                return (one / inside).resolve(), words
+        raise
+
+
 def packages(name: str, beside: Path | None) -> Iterator[Path]:
     """The folders that may be the package `name`, the nearest first."""
     if not name or name in (".", ".."):
