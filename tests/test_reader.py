@@ -1,13 +1,16 @@
 """The log's reader: whatever happened to the file, everything that is sound, and a line on what is not."""
 
+import os
 import random
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.JointState_pb2 import JointState
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from google.protobuf import descriptor_pb2
 from log_samples import same, samples, write_log
 from mcap.writer import IndexType, Writer
@@ -94,6 +97,23 @@ def test_series_reach_into_nested_and_repeated_messages(tmp_path):
     found = log.series("/pair", ["left.green", "sequence"])
     assert [len(rows) for rows in found["left.green"]] == [0, 1, 2]
     assert found["sequence"].tolist() == [0, 1, 2]
+
+
+def test_series_of_lists_of_different_lengths_are_objects(tmp_path):
+    with LogWriter(tmp_path / "a.mcap") as log:
+        for k in range(2):
+            drawing = ImageAnnotations()
+            for corners in (3, 4):
+                drawing.points.add(points=[Point2(x=n, y=k) for n in range(corners)])
+            log.write("/drawn", drawing, k)
+    found = LogReader(tmp_path / "a.mcap").series("/drawn", ["points.points.x"])["points.points.x"]
+    assert found.dtype == object and found[1] == [[0, 1, 2], [0, 1, 2, 3]]
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.mcap")
+    with pytest.raises(ConfigError, match="log .*pipe.mcap is a device, pipe or socket, not a file"):
+        LogReader(tmp_path / "pipe.mcap")
 
 
 def test_a_log_cut_off_anywhere_gives_all_complete_chunks(whole, records, tmp_path):

@@ -152,6 +152,13 @@ def test_export_csv_has_time_in_ns_and_every_value_to_the_bit(log, capsys, tmp_p
     assert values == messages[3][2].X_LV.ravel().tolist()
 
 
+@pytest.mark.parametrize("folder", ["/", "."])
+@pytest.mark.parametrize("options", [(), ("--export", "csv", "--topic", "/x")])
+def test_a_folder_is_no_log_whatever_it_is_called(folder, options, capsys):
+    code, _, error = review(capsys, folder, *options)
+    assert code == 2 and f"log {folder} cannot be read: Is a directory" in error
+
+
 def test_export_goes_beside_the_log_by_default_and_names_joints(log, capsys, tmp_path):
     assert review(capsys, log, "--export", "csv", "--topic", "/joint_states")[0] == 0
     head, rows = table(tmp_path / "run.joint_states.csv")

@@ -35,7 +35,7 @@ def command(options: argparse.Namespace) -> int:
     if options.export or options.topic or options.out:
         return _export(options)
     name = "-".join(log.stem for log in options.logs)
-    html = options.html or (None if options.json else options.logs[0].with_name(f"{name}.review.html"))
+    html = options.html or (None if options.json else options.logs[0].parent / f"{name}.review.html")
     if html is not None:
         html = outputs.check(html, "--html", options.logs, report.was_made)
     found = [report.review(log) for log in options.logs]
@@ -102,7 +102,7 @@ def _export(options: argparse.Namespace) -> int:
     if len(options.logs) != 1:
         raise ConfigError(f"an export is of one log, got {len(options.logs)}")
     name = f"{options.logs[0].stem}{options.topic.replace('/', '.')}.{options.export}"
-    out = outputs.check(options.out or options.logs[0].with_name(name), "--out", options.logs, export.was_made)
+    out = outputs.check(options.out or options.logs[0].parent / name, "--out", options.logs, export.was_made)
     log = LogReader(options.logs[0])
     count = export.write(log, options.topic, options.export, out)
     if options.json:

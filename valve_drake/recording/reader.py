@@ -8,6 +8,7 @@ import dataclasses as dc
 import functools
 import mmap
 import os
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -162,6 +163,7 @@ class LogReader:
         """One topic as arrays: "time" (N,) [s] and every field (N, ...); a dotted name reaches into nested messages.
 
         A field of repeated messages gives (N, n). None becomes NaN. Rows of different shapes make an array of objects.
+        Raises ConfigError if the log has no such topic, AttributeError if its messages have no such field.
         """
         names = list(fields)
         times: list[float] = []
@@ -278,7 +280,9 @@ class _Attachments(Mapping[str, Attachment]):
 
 def _open(path: Path) -> mmap.mmap:
     try:
-        with open(path, "rb") as file:
+        with open(path, "rb", opener=_without_waiting) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ConfigError(f"log {path} is a device, pipe or socket, not a file")
             begin = file.read(64)
             if not begin:
                 raise ConfigError(f"log {path} is empty")
@@ -297,6 +301,11 @@ def _open(path: Path) -> mmap.mmap:
         raise ConfigError(f"log {path} cannot be read: {error.strerror}") from None
 
 
+def _without_waiting(path: str, flags: int) -> int:
+    """An opener that does not wait for somebody to write into a pipe."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
 def _reach(value: Any, names: list[str]) -> Any:
     """value.name.name..., taken of every element where there is a sequence."""
     for k, name in enumerate(names):
@@ -308,10 +317,15 @@ def _reach(value: Any, names: list[str]) -> Any:
 
 def _stack(column: list[Any]) -> np.ndarray:
     """Values as one array (N, ...): None as NaN of the others' shape; objects when shapes differ."""
-    shapes = {np.shape(value) for value in column if value is not None}
-    if len(shapes) > 1:
+    try:
+        shapes = {np.shape(value) for value in column if value is not None}
+        alike = len(shapes) <= 1
+    except ValueError:  # lists of lists of different lengths have no shape
+        alike = False
+    if not alike:
         rows = np.empty(len(column), object)
-        rows[:] = column
+        for k, value in enumerate(column):
+            rows[k] = value
         return rows
     filler = np.full(next(iter(shapes), ()), np.nan)
     return np.array([filler if value is None else value for value in column])
