@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from valve_drake import frames
-from valve_drake.camera.calibration_file import load_calibration
+from valve_drake.camera.calibration_file import is_own, load_calibration, save_camera
 from valve_drake.camera.lens import OpenCvLens, StereoHead, lens_to, save_head
 from valve_drake.checks import ConfigError
 
@@ -262,6 +262,13 @@ def test_bad_kalibr_file_is_one_clear_line(tmp_path, change, says):
     assert "4 rows" in refused(tmp_path, kalibr(2) | {"cam1": kalibr()["cam0"] | {"T_cn_cnm1": [1]}})
 
 
+def test_a_transform_that_is_none_is_named_by_the_files_key(tmp_path):
+    tree = kalibr(2)
+    for value in (0.5, float("nan")):
+        tree["cam1"]["T_cn_cnm1"][0][0] = value
+        assert "cam1.T_cn_cnm1 must be a 3x4 rigid transform" in refused(tmp_path, tree)
+
+
 def test_what_is_no_calibration_is_told_what_can_be_read(tmp_path):
     for content in (
         {"a": 1},
@@ -289,6 +296,19 @@ def test_xml_expands_nothing(tmp_path):
     fish = VISP.replace("perspectiveProjWithDistortion", "ProjWithKannalaBrandtDistortion")
     only = fish[: fish.index("<model>")] + fish[fish.rindex("<model>") :]
     assert "a fisheye's" in refused(tmp_path, only)
+
+
+def test_xml_that_says_a_thing_twice_is_refused_by_its_name(tmp_path):
+    width = "<image_width>640</image_width>"
+    opencv = f"<opencv_storage>{width}{width}</opencv_storage>"
+    assert "'image_width' stands twice" in refused(tmp_path, opencv)
+    rows = "<rows>3</rows>"
+    matrix = f"<K type_id='opencv-matrix'>{rows}{rows}</K>"
+    assert "K: 'rows' stands twice" in refused(tmp_path, f"<opencv_storage>{matrix}</opencv_storage>")
+    assert "image_width must be given once" in refused(tmp_path, VISP.replace(width, 2 * width))
+    assert "'px' stands twice" in refused(tmp_path, VISP.replace("<px>600.5</px>", "<px>600.5</px><px>601</px>"))
+    other = VISP.replace("perspectiveProjWithoutDistortion", "perspectiveProjWithDistortion")
+    assert "model must be given once of each type" in refused(tmp_path, other)
 
 
 # ---------------------------------------------------------------- the program's own
@@ -319,6 +339,8 @@ def own(tmp_path: pathlib.Path) -> dict:
         (("left", "sigma_px"), [[0.1, 0.2]], "left.sigma_px must be"),
         (("left", "sigma_px"), [[0.1, -0.2], [1, 1]], "left.sigma_px must be"),
         (("left",), None, "left must be a mapping"),
+        (("X_LR", 0, 0), 0.9, "cam.yaml: X_LR must be a 3x4 rigid transform"),
+        (("rms_px",), True, "rms_px must be"),
         (("rms_px",), "x", "rms_px must be"),
         (("rms_px",), [1], "rms_px must be"),
     ],
@@ -330,6 +352,22 @@ def test_bad_value_of_a_calibration_is_one_clear_line(tmp_path, where, value, sa
         inner = inner[name]
     inner[where[-1]] = value
     assert says in refused(tmp_path, tree)
+
+
+def test_only_a_calibration_of_this_program_may_be_replaced(tmp_path):
+    save_head(StereoHead(LENS, LENS, X_LR), tmp_path / "head.yaml")
+    save_camera(LENS, tmp_path / "hand.yaml", X_EC=np.eye(4))
+    assert is_own(tmp_path / "head.yaml") and is_own(tmp_path / "hand.yaml")
+    whole = yaml.safe_load((tmp_path / "hand.yaml").read_text())
+    for others in (
+        {"camera": "front", "robot": "mine"},
+        {"left": 1, "right": 2, "X_LR": 3},
+        whole | {"notes": "kept here"},
+        own(tmp_path) | {"notes": "kept here"},
+        {"camera": whole["camera"] | {"exposure": 3}},
+        [1, 2],
+    ):
+        assert not is_own(written(tmp_path, others))
 
 
 def test_the_map_of_standard_deviations_survives_the_file(tmp_path):

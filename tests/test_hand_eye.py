@@ -215,6 +215,14 @@ def test_the_other_mount_is_refused(command, tmp_path):
     assert code == 2 and "leave out --eye-to-hand" in err and not (tmp_path / "hand.yaml").exists()
 
 
+def test_two_images_of_one_name_are_refused_since_poses_are_told_apart_by_it(command, tmp_path):
+    (tmp_path / "again").mkdir()
+    (tmp_path / "again" / "3.png").touch()
+    code, _, err = command(lambda poses: poses, "--images", str(tmp_path / "*.png"), str(tmp_path / "again" / "*.png"))
+    assert code == 2 and "--images must be of different names" in err and "again/3.png" in err
+    assert not (tmp_path / "hand.yaml").exists()
+
+
 def test_a_blunder_does_not_hide_the_mistake(command):
     def change(poses: list[np.ndarray]) -> list[np.ndarray]:
         bad = frames.make(poses[4][:, :3], poses[4][:, 3] + 0.1)

@@ -15,9 +15,9 @@ from google.protobuf import descriptor_pb2
 from log_samples import same, samples, write_log
 from mcap.writer import IndexType, Writer
 
-from valve_drake.checks import ConfigError
+from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.messages import Command, Message, RobotState, Segmentation, SegmentationPair, Status
-from valve_drake.recording import schemas
+from valve_drake.recording import rerun_view, schemas
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recovery import recover
 from valve_drake.recording.writer import LogWriter
@@ -114,6 +114,13 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe.mcap")
     with pytest.raises(ConfigError, match="log .*pipe.mcap is a device, pipe or socket, not a file"):
         LogReader(tmp_path / "pipe.mcap")
+
+
+def test_what_rerun_cannot_do_is_one_line_and_a_failure(capsys):
+    assert rerun_view.main(["/"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    with pytest.raises(OperationFailed, match=r"rerun no such failed: [^\[\n]+$"):
+        rerun_view._rerun("no", "such")
 
 
 def test_a_log_cut_off_anywhere_gives_all_complete_chunks(whole, records, tmp_path):

@@ -1,6 +1,5 @@
 """One way to refuse a bad value: a line that names the key, the rule and the value."""
 
-import math
 import reprlib
 from pathlib import PurePath
 from typing import Any
@@ -56,6 +55,5 @@ def is_number(value: object) -> bool:
 
 
 def require_in(value: float, low: float, high: float, key: str) -> None:
-    """`value` is a finite number within [low, high]."""
-    good = isinstance(value, int | float) and math.isfinite(value) and low <= value <= high
-    require(good, key, f"within [{low:g}, {high:g}]", value)
+    """Raises ConfigError unless `value` is a finite number within [low, high]."""
+    require(is_number(value) and low <= value <= high, key, f"within [{low:g}, {high:g}]", value)

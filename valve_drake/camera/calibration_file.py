@@ -12,6 +12,7 @@ from valve_drake.camera.lens import LensModel, StereoHead, head_from, lens_from,
 from valve_drake.checks import ConfigError
 
 _HEAD = {"left", "right", "X_LR", "rms_px"}
+_CAMERA = {"camera", "X_EC", "X_BC"}  # what `save_camera` writes: a lens, and where it is if that was calibrated
 
 
 def load_calibration(paths: Sequence[Path]) -> StereoHead | LensModel:
@@ -47,12 +48,19 @@ def save_camera(lens: LensModel, path: Path, comment: str = "", **more: np.ndarr
 
 
 def is_own(path: Path) -> bool:
-    """Whether a file is a calibration that this program wrote, which a new one may replace."""
+    """Whether a file is a calibration that this program wrote, which a new one may replace: it can be read as one and
+    holds nothing else."""
     try:
         data = yaml_file.read(path)
+        if not isinstance(data, dict):
+            return False
+        if "camera" in data:
+            lens_from(data["camera"], "camera")
+        else:
+            head_from(data, "head")
     except ConfigError:
         return False
-    return isinstance(data, dict) and ({"left", "right", "X_LR"} <= set(data) or set(data) >= {"camera"})
+    return "camera" not in data or set(data) <= _CAMERA
 
 
 def _mapping(text: str, key: str) -> dict[str, Any]:

@@ -6,14 +6,14 @@ refused by its name, since it may be a misspelt one, and so is a model that is n
 
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 
 import numpy as np
 
 from valve_drake import frames
-from valve_drake.camera.lens import LensModel, OpenCvLens, StereoHead, check_baseline
+from valve_drake.camera.lens import LensModel, OpenCvLens, StereoHead, check_rigid, head_of
 from valve_drake.checks import ConfigError, require, shown
 
 READ = (
@@ -89,7 +89,8 @@ def pair(data: list[dict[str, Any]], keys: list[str]) -> StereoHead:
             f"{keys[1]}: projection_matrix has its baseline along y: cameras one above the other are not supported"
         )
     require(P[3] < 0, f"{keys[1]}: projection_matrix[3]", "< 0: the right camera comes second", float(P[3]))
-    return _head(lenses, frames.make(R[0].T @ R[1], R[0].T @ np.array([-P[3] / P[0], 0, 0])), keys[1])
+    X_LR = frames.make(R[0].T @ R[1], R[0].T @ np.array([-P[3] / P[0], 0, 0]))
+    return head_of(lenses[0], lenses[1], X_LR, f"{keys[1]}: the cameras' transform")
 
 
 # ---------------------------------------------------------------- Kalibr
@@ -117,7 +118,9 @@ def kalibr(data: dict[str, Any], key: str) -> LensModel | StereoHead:
     inner = f"{key}: {names[1]}.T_cn_cnm1"
     T = _numbers(data[names[1]].get("T_cn_cnm1"), inner)  # takes points from cam0 to cam1
     require(len(T) == 16, inner, "4 rows of 4 numbers", T.tolist())
-    return _head(lenses, frames.inverse(T.reshape(4, 4)[:3]), inner)
+    X_RL = T.reshape(4, 4)[:3]
+    check_rigid(X_RL, inner)
+    return head_of(lenses[0], lenses[1], frames.inverse(X_RL), inner)
 
 
 def _kalibr_lens(data: Any, key: str) -> OpenCvLens:
@@ -150,7 +153,8 @@ def from_xml(text: str, key: str) -> LensModel | StereoHead:
     except (ElementTree.ParseError, ValueError) as error:
         raise ConfigError(f"{key}: not XML ({error})") from error
     if root.tag == "opencv_storage":
-        return camera({node.tag: _opencv_node(node) for node in root}, key)
+        _refuse_twice(root, key)
+        return camera({node.tag: _opencv_node(node, key) for node in root}, key)
     cameras = root.findall("camera")
     if not cameras:
         raise ConfigError(f"{key}: XML without a camera; read are {READ}")
@@ -159,9 +163,18 @@ def from_xml(text: str, key: str) -> LensModel | StereoHead:
     return _visp(cameras[0], key)
 
 
-def _opencv_node(node: ElementTree.Element) -> Any:
+def _refuse_twice(node: ElementTree.Element, key: str) -> None:
+    """Raises ConfigError where a name stands twice inside a node: nobody sees which of the two is meant."""
+    names = [part.tag for part in node]
+    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    if twice is not None:
+        raise ConfigError(f"{key}: {shown(twice)} stands twice")
+
+
+def _opencv_node(node: ElementTree.Element, key: str) -> Any:
     text = (node.text or "").strip()
     if node.get("type_id") == "opencv-matrix":
+        _refuse_twice(node, f"{key}: {node.tag}")
         return {
             part.tag: (part.text or "").split() if part.tag == "data" else (part.text or "").strip() for part in node
         }
@@ -174,15 +187,22 @@ def _visp(node: ElementTree.Element, key: str) -> OpenCvLens:
         ("name", "image_width", "image_height", "sampling_width", "sampling_height", "model", "additional_information"),
         key,
     )
-    size = [_number(node.findtext(name, "").strip()) for name in ("image_width", "image_height")]
+    sizes = ("image_width", "image_height")
+    for name in sizes:
+        require(
+            len(node.findall(name)) == 1, f"{key}: {name}", "given once", [part.text for part in node.findall(name)]
+        )
+    size = [_number(node.findtext(name, "").strip()) for name in sizes]
     for name in ("sampling_width", "sampling_height"):
         step = _number(node.findtext(name, "1").strip())
         require(step in (0, 1), f"{key}: {name}", "1", step)
     models = {model.findtext("type", "").strip(): model for model in node.findall("model")}
+    require(len(models) == len(node.findall("model")), f"{key}: model", "given once of each type", list(models))
     kinds = {"perspectiveProjWithDistortion": 5, "perspectiveProjWithoutDistortion": 4}
     kind = next((name for name in kinds if name in models), None)
     if kind is None:
         _refuse_model(next(iter(models), None), f"{key}: model")
+    _refuse_twice(models[kind], f"{key}: {kind}")
     names = ("px", "py", "u0", "v0", "kud")[: kinds[kind]]
     _refuse_unknown([part.tag for part in models[kind]], ("type", "px", "py", "u0", "v0", "kud", "kdu"), key)
     px, py, u0, v0, *kud = _numbers(
@@ -238,12 +258,6 @@ def _lens(K: np.ndarray, D: np.ndarray, size: list[Any], key: str) -> OpenCvLens
     lens = OpenCvLens(K, D, width, height)
     lens.check(key)
     return lens
-
-
-def _head(lenses: Sequence[LensModel], X_LR: np.ndarray, key: str) -> StereoHead:
-    head = StereoHead(lenses[0], lenses[1], X_LR)
-    check_baseline(head, key)
-    return head
 
 
 def _refuse_unknown(names: Iterable[str], known: Iterable[str], key: str) -> None:

@@ -11,7 +11,7 @@ from valve_drake import frames
 from valve_drake.camera import hand_eye as solver
 from valve_drake.camera import hand_eye_mistakes as mistakes
 from valve_drake.camera import hand_eye_page
-from valve_drake.camera.board import Board, natural
+from valve_drake.camera.board import Board, find_images, natural
 from valve_drake.camera.calibration_file import load_calibration, save_camera
 from valve_drake.camera.calibration_report import Report, calibrated, finite, look, named
 from valve_drake.camera.hand_eye_poses import read_poses
@@ -35,6 +35,10 @@ def hand_eye(
     Writes `out`. Raises ConfigError, and writes nothing, for poses that do not belong to the images.
     """
     X_BE = read_poses(poses)
+    of_name: dict[str, Path] = {}
+    for path in find_images(images, "--images"):
+        if (other := of_name.setdefault(path.name, path)) != path:
+            raise ConfigError(f"--images must be of different names, by which they get their poses: {other} and {path}")
     pictures = look(board, (images,), ("--images",))
     lens = load_calibration([camera]) if camera else calibrated(pictures, board, "opencv", None).fit.lenses[0]
     if isinstance(lens, StereoHead):

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from valve_drake import outputs, yaml_file
-from valve_drake.checks import ConfigError, require, require_in, shown
+from valve_drake.checks import ConfigError, is_number, require, require_in, shown
 
 SigmaMap: TypeAlias = Sequence[Sequence[float]] | None  # rows from top to bottom, evenly over the image [px]
 
@@ -82,7 +82,7 @@ class Lens:
     def check(self, key: str = "lens") -> None:
         """Raises ConfigError unless eq. (1) can be inverted over the whole image."""
         for name in ("k_u", "k_v"):
-            require(_is_number(getattr(self, name)), f"{key}.{name}", "a finite number", getattr(self, name))
+            require(is_number(getattr(self, name)), f"{key}.{name}", "a finite number", getattr(self, name))
         for name in ("k_x", "k_y"):
             require_in(getattr(self, name), 1.0, _MOST_PX, f"{key}.{name}")
         for name in ("u_0", "v_0"):
@@ -249,9 +249,7 @@ class StereoHead:
 
     def __post_init__(self) -> None:
         X = np.array(self.X_LR, float)
-        R = X[:, :3]
-        rigid = X.shape == (3, 4) and np.isfinite(X).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-4
-        require(bool(rigid and np.linalg.det(R) > 0), "head.X_LR", "a 3x4 rigid transform [R | p]", X.tolist())
+        check_rigid(X, "head.X_LR")
         X.setflags(write=False)
         object.__setattr__(self, "X_LR", X)
 
@@ -276,11 +274,23 @@ def head_from(data: dict[str, Any], key: str) -> StereoHead:
     rule = "3 rows of 4 finite numbers"
     X_LR = data["X_LR"]
     rows = isinstance(X_LR, list) and len(X_LR) == 3 and all(isinstance(row, list) and len(row) == 4 for row in X_LR)
-    require(rows and all(_is_number(value) for row in X_LR for value in row), f"{key}: X_LR", rule, X_LR)
-    lenses = [lens_from(data[side], f"{key}: {side}") for side in ("left", "right")]
-    head = StereoHead(lenses[0], lenses[1], np.array(X_LR, float), rms_px=float(rms_px))
-    check_baseline(head, f"{key}: X_LR")
+    require(rows and all(is_number(value) for row in X_LR for value in row), f"{key}: X_LR", rule, X_LR)
+    left, right = (lens_from(data[side], f"{key}: {side}") for side in ("left", "right"))
+    return head_of(left, right, np.array(X_LR, float), f"{key}: X_LR", float(rms_px))
+
+
+def head_of(left: LensModel, right: LensModel, X_LR: np.ndarray, key: str, rms_px: float = 0.0) -> StereoHead:
+    """The head of two cameras side by side, X_LR (3, 4) [m]. Raises ConfigError naming `key` if it is none."""
+    check_rigid(X_LR, key)
+    head = StereoHead(left, right, X_LR, rms_px)
+    check_baseline(head, key)
     return head
+
+
+def check_rigid(X: np.ndarray, key: str) -> None:
+    """Raises ConfigError naming `key` unless X is a rigid transform (3, 4)."""
+    rigid = X.shape == (3, 4) and np.isfinite(X).all() and np.abs(X[:, :3] @ X[:, :3].T - np.eye(3)).max() < 1e-4
+    require(bool(rigid and np.linalg.det(X[:, :3]) > 0), key, "a 3x4 rigid transform [R | p]", X.tolist())
 
 
 def check_baseline(head: StereoHead, key: str) -> None:
@@ -313,7 +323,7 @@ def lens_from(data: Any, key: str) -> LensModel:
     for name, rows in (("K", True), ("dist", False)) if kind is OpenCvLens else ():
         value = data[name]
         lists = [row for row in value if isinstance(row, list)] if isinstance(value, list) and rows else [value]
-        numbers = all(isinstance(row, list) and all(map(_is_number, row)) for row in lists)
+        numbers = all(isinstance(row, list) and all(map(is_number, row)) for row in lists)
         shape = not rows or (isinstance(value, list) and [len(row) for row in lists] == [3] * 3 == [len(value)] * 3)
         require(bool(numbers and shape), f"{key}.{name}", "3 rows of 3 numbers" if rows else "a list of numbers", value)
     lens = kind(**data)
@@ -339,10 +349,6 @@ def _require_keys(data: dict[str, Any], names: set[str], key: str, optional: Set
         raise ConfigError(f"{key} {' and '.join(parts)}")
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-
-
 def _check_size(lens: LensModel, key: str) -> None:
     for name in ("width", "height"):
         value = getattr(lens, name)
@@ -355,7 +361,7 @@ def _check_sigma(grid: SigmaMap, key: str) -> None:
         return
     rows = isinstance(grid, list) and 2 <= len(grid) <= 64 and all(isinstance(row, list) for row in grid)
     ok = rows and 2 <= len(grid[0]) <= 64 and all(len(row) == len(grid[0]) for row in grid)
-    ok = ok and all(_is_number(value) and 0 <= value <= _MOST_PX for row in grid for value in row)
+    ok = ok and all(is_number(value) and 0 <= value <= _MOST_PX for row in grid for value in row)
     require(ok, f"{key}.sigma_px", "2 to 64 rows of as many numbers >= 0", grid)
 
 

@@ -108,7 +108,8 @@ def _rgba(color: Color) -> list[float]:
 def write(source: Path, out: Path) -> list[str]:
     """Writes what can be read of the log `source` as Rerun's recording `out` -> the log's damage, in lines.
 
-    Raises ConfigError if `source` is no log, the extra is missing, Rerun fails or `out` is a file of another kind.
+    Raises ConfigError if `source` is no log, the extra is missing or `out` is a file of another kind; OperationFailed
+    if Rerun fails or `out` cannot be written.
     """
     out = outputs.check(out, "the Rerun recording", [source], _is_recording)
     try:
@@ -136,22 +137,29 @@ def write(source: Path, out: Path) -> list[str]:
 
 
 def _is_recording(path: Path) -> bool:
-    with open(path, "rb") as file:
-        return file.read(3) == b"RRF"
+    """Whether a file is a Rerun recording, which a new one may replace."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(3) == b"RRF"
+    except OSError:
+        return False
 
 
 def _rerun(*arguments: str | Path) -> None:
+    """Runs Rerun's own program. Raises OperationFailed with the last line that it wrote."""
     done = subprocess.run([sys.executable, "-m", "rerun", *arguments], capture_output=True, text=True)
     if done.returncode != 0:
-        raise ConfigError(f"rerun {arguments[0]} {arguments[1]} failed: {done.stderr.strip().splitlines()[-1:]}")
+        words = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+        raise OperationFailed(f"rerun {arguments[0]} {arguments[1]} failed: {words}")
 
 
 def main(arguments: list[str]) -> int:
+    """The program: `arguments` without its name -> exit code, as of the commands."""
     if len(arguments) != 1:
         print("usage: python -m valve_drake.recording.rerun_view LOG", file=sys.stderr)
         return 2
     source = Path(arguments[0])
-    out = source.with_suffix(".rrd")
+    out = source.parent / f"{source.stem}.rrd"
     try:
         damage = write(source, out)
     except (ConfigError, OperationFailed) as error:
