@@ -15,6 +15,7 @@ import time
 import numpy as np
 import pytest
 import review_samples as sample
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from valve_drake import cli
 from valve_drake.analysis import export
@@ -212,6 +213,57 @@ def test_export_of_changing_lengths_absent_groups_truth_and_nested_messages(tmp_
     export.write(reader, "/i", "csv", tmp_path / "i.csv")
     head, rows = table(tmp_path / "i.csv")
     assert rows[0][head.index("timestamp")] == "0.25" and rows[0][head.index("data.bytes")] == "5"
+
+
+def foreign_messages():
+    """The class of a message of another program: elements with names, a map, and a time of its own."""
+    field = descriptor_pb2.FieldDescriptorProto
+    file = descriptor_pb2.FileDescriptorProto(name="other.proto", package="other", syntax="proto3")
+    part = file.message_type.add(name="Part")
+    part.field.add(name="x", number=1, type=field.TYPE_DOUBLE, label=field.LABEL_OPTIONAL)
+    for name, kind in (("Text", field.TYPE_STRING), ("Number", field.TYPE_INT32), ("Nested", field.TYPE_MESSAGE)):
+        element = file.message_type.add(name=name)
+        own = element.field.add(name="name", number=1, type=kind, label=field.LABEL_OPTIONAL)
+        if kind == field.TYPE_MESSAGE:
+            own.type_name = ".other.Part"
+        element.field.add(name="x", number=2, type=field.TYPE_DOUBLE, label=field.LABEL_OPTIONAL)
+    message = file.message_type.add(name="Message")
+    message.field.add(name="time_ns", number=1, type=field.TYPE_INT64, label=field.LABEL_OPTIONAL)
+    for number, name in enumerate(("Text", "Number", "Nested"), start=2):
+        of = f".other.{name}"
+        repeated = field.LABEL_REPEATED
+        message.field.add(name=name.lower(), number=number, type=field.TYPE_MESSAGE, type_name=of, label=repeated)
+    entry = message.nested_type.add(name="GainsEntry")
+    entry.options.map_entry = True
+    entry.field.add(name="key", number=1, type=field.TYPE_STRING, label=field.LABEL_OPTIONAL)
+    entry.field.add(name="value", number=2, type=field.TYPE_DOUBLE, label=field.LABEL_OPTIONAL)
+    of = ".other.Message.GainsEntry"
+    message.field.add(name="gains", number=5, type=field.TYPE_MESSAGE, type_name=of, label=field.LABEL_REPEATED)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("other.Message"))
+
+
+def test_export_of_another_programs_messages_drops_no_value_and_has_each_column_once(tmp_path):
+    message = foreign_messages()(time_ns=77, gains={"p": 1.5, "d": 0.25})
+    for name, x in (("a", 1), ("a", 2), ("b", 3), ("", 4), ("3", 5)):
+        message.text.add(name=name, x=x)
+    message.number.add(name=5, x=6)
+    message.nested.add(x=7).name.x = 8
+    when = 2**63 + 5  # ns; an MCAP time has 64 bits
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        writer.write("/m", message, 0.0)
+    log = LogReader(tmp_path / "a.mcap")
+    rows = [(when, export.leaves(log.decode(record))) for record in log.records(["/m"])]
+    head, values = (line.split(",") for line in export.to_csv(rows).splitlines())
+    assert len(set(head)) == len(head)
+    found = dict(zip(head, values))
+    assert found["time_ns"] == str(when) and found["message_time_ns"] == "77"
+    assert (found["gains[p]"], found["gains[d]"]) == ("1.5", "0.25")
+    assert [found[f"text[{k}].x"] for k in (0, 1, "b", 3, 4)] == ["1.0", "2.0", "3.0", "4.0", "5.0"]
+    assert (found["number[0].x"], found["nested[0].x"], found["nested[0].name.x"]) == ("6.0", "7.0", "8.0")
+    arrays = export.to_arrays(rows)
+    assert arrays["time_ns"].tolist() == [when] and arrays["message_time_ns"].tolist() == [77]
 
 
 def test_export_of_truth_uses_its_names(log, capsys, tmp_path):

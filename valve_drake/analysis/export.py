@@ -1,13 +1,15 @@
 """One topic of a log as a table: CSV for spreadsheets, NPZ for numpy.
 
 Columns are named as in Foxglove's message paths: `p_LV[2]`, `left.corners_px[0]`, and `joints[left_arm_1].position` for
-elements that have a name. Arrays are flat and row-major, as in the log. Bytes (images) are given by their number.
+elements that have a name of their own. Arrays are flat and row-major, as in the log. Bytes (images) are given by their
+number. A message's own `time` and `time_ns` are `message_time` and `message_time_ns`.
 """
 
+import collections
 import csv
 import io
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +68,8 @@ def to_csv(rows: Sequence[tuple[int, dict[str, Any]]]) -> str:
 
 def to_arrays(rows: Sequence[tuple[int, dict[str, Any]]]) -> dict[str, np.ndarray]:
     """Every field as one array (N, ...) beside `time_ns` and `time`; arrays of changing length are padded with NaN."""
-    when = np.array([when for when, _ in rows], np.int64)
+    whens = [when for when, _ in rows]
+    when = np.array(whens, np.int64 if max(whens, default=0) < 2**63 else np.uint64)
     out = {"time_ns": when, "time": when / NANO}
     for name in dict.fromkeys(name for _, row in rows for name in row):
         out[name] = _stacked([row.get(name) for _, row in rows])
@@ -76,7 +79,8 @@ def to_arrays(rows: Sequence[tuple[int, dict[str, Any]]]) -> dict[str, np.ndarra
 def leaves(message: Message | Proto, path: str = "") -> dict[str, Any]:
     """The fields of a message by dotted path: numbers, texts, and arrays as they are."""
     if isinstance(message, Vector):
-        return {"message_time": message.time} | dict(zip(message.names, message.values.tolist()))
+        names = _distinct(message.names)
+        return {"message_time": message.time} | dict(zip(names, message.values.tolist()))
     fields: Iterable[tuple[str, Any]]
     if isinstance(message, Message):
         fields = vars(message).items()
@@ -86,7 +90,7 @@ def leaves(message: Message | Proto, path: str = "") -> dict[str, Any]:
     for name, value in fields:
         if isinstance(value, np.ndarray) and value.dtype == np.uint8:
             continue  # pixels are not logged here
-        name = "message_time" if name == "time" and not path else name
+        name = f"message_{name}" if name in ("time", "time_ns") and not path else name
         out |= _leaf(f"{path}{name}", value)
     return out
 
@@ -100,18 +104,28 @@ def _leaf(path: str, value: Any) -> dict[str, Any]:
         return {f"{path}.bytes": len(value)}
     if value is None or isinstance(value, str | bool | int | float | np.ndarray):
         return {path: value}
+    if isinstance(value, Mapping):
+        parts = [_leaf(f"{path}[{key}]", element) for key, element in value.items()]
+        return {name: leaf for part in parts for name, leaf in part.items()}
     elements = list(value)
     if all(isinstance(element, int | float) for element in elements):
         return {path: np.array(elements, float)}
     if all(isinstance(element, str) for element in elements):
         return {path: ";".join(elements)}
     out: dict[str, Any] = {}
-    for k, element in enumerate(elements):
-        name = getattr(element, "name", "")
-        out |= _leaf(f"{path}[{name or k}]", element)
-        if name:
+    names = [getattr(element, "name", "") for element in elements]
+    own = [isinstance(name, str) and name != "" and not name.isdecimal() and names.count(name) == 1 for name in names]
+    for k, (element, name) in enumerate(zip(elements, names)):
+        out |= _leaf(f"{path}[{name if own[k] else k}]", element)
+        if own[k]:
             del out[f"{path}[{name}].name"]
     return out
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, those that stand more than once with their number behind them."""
+    count = collections.Counter(names)
+    return [name if count[name] == 1 else f"{name}[{k}]" for k, name in enumerate(names)]
 
 
 def _expanded(row: dict[str, Any]) -> dict[str, Any]:
