@@ -5,10 +5,12 @@ import itertools
 import json
 import re
 import shutil
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from log_samples import write_log
 from pydrake.systems.analysis import Simulator
 from robot_facts import GROUPS
@@ -316,6 +318,30 @@ def test_a_missing_image_is_named_in_one_line(log, tmp_path, capsys):
     first = next(log.messages(["/head_left/image"]))[1]
     lacking = rewritten(log, tmp_path / "a.mcap", lambda name: name != "/head_left/image", end=first + 0.1)
     assert f"lacks the image 0 of head_left at t = {first:.3f} s" in one_line(capsys, ["replay", lacking], 2)
+
+
+def claiming(jpeg, width, height):
+    """The JPEG with another size in its header."""
+    at = jpeg.index(b"\xff\xc0") + 5
+    return jpeg[:at] + struct.pack(">HH", height, width) + jpeg[at + 4 :]
+
+
+@pytest.mark.parametrize("change", [lambda data: data[:200] + b"\xff\xd9", lambda data: claiming(data, 30000, 30000)])
+def test_an_image_that_cannot_be_decoded_is_named_in_one_line(change, log, tmp_path, capsys):
+    _, first, image = next(log.messages(["/head_left/image"]))
+    bad = CompressedImage.FromString(image.SerializeToString())
+    bad.data = change(image.data)
+    also, others = [("/head_left/image", bad, first)], lambda name: name != "/head_left/image"
+    path = rewritten(log, tmp_path / "a.mcap", others, end=first + 0.1, also=also)
+    words = f"holds an image that cannot be decoded: of head_left at t = {first:.3f} s"
+    assert words in one_line(capsys, ["replay", path], 2)
+
+
+@pytest.mark.parametrize("topic", ["/health", "/joint_states", "/left_wrist/wrench", "/handle_marker/marks"])
+def test_a_topic_of_another_schema_is_named_in_one_line(topic, log, tmp_path, capsys):
+    other = [(topic, Status(time=0.0), 0.0)]
+    path = rewritten(log, tmp_path / "a.mcap", lambda name: name != topic, also=other)
+    assert f"{topic} holds valve_drake.Status, not " in one_line(capsys, ["replay", path], 2)
 
 
 def test_a_log_of_another_version_is_refused_in_one_line_or_noted(log, tmp_path, capsys):

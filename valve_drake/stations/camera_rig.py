@@ -36,6 +36,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, State
 from pydrake.systems.sensors import CameraInfo
 
 from valve_drake import profiling
+from valve_drake.camera.image_file import MAX_PIXELS, jpeg_size
 from valve_drake.camera.lens import LensModel, distortion_maps
 from valve_drake.frames import compose, inverse, make, rot_z
 from valve_drake.messages import CameraFrame
@@ -312,11 +313,13 @@ def _jpeg(image: np.ndarray, quality: int) -> bytes:
 
 
 def decode_image(data: bytes) -> np.ndarray:
-    """JPEG bytes -> (H, W, 3) RGB. Raises ValueError if they are no whole image."""
+    """JPEG bytes -> (H, W, 3) RGB. Raises ValueError if they are no whole image, or one of more than MAX_PIXELS."""
+    width, height = jpeg_size(data) or (0, 0)
+    whole = 0 < width * height <= MAX_PIXELS and data.rfind(b"\xff\xd9") >= 0
     try:
         # The EXIF orientation is not applied: a calibration refers to the sensor's own pixels.
         flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data.rfind(b"\xff\xd9") >= 0 else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if whole else None
     except (cv2.error, MemoryError):
         image = None
     if image is None:

@@ -23,14 +23,17 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, Diagram
 
 from valve_drake.checks import ConfigError
-from valve_drake.messages import SIDES, CameraFrame
+from valve_drake.messages import SIDES, CameraFrame, Health, Message, OperatorCommand, OperatorPackets
 from valve_drake.ports import TICK, PythonSystem
 from valve_drake.recording.foxglove import NANO, nanoseconds
 from valve_drake.recording.reader import LogReader, Record
+from valve_drake.recording.schemas import Wrench, proto_class
 from valve_drake.recording.signals import FRAMES, JOINED, measured, topic_of
 from valve_drake.robot.groups import Groups
 from valve_drake.stations.camera_rig import decode_image
@@ -49,6 +52,17 @@ def _vectors(groups: Groups) -> dict[str, dict[str, list[str]]]:
     ports = measured(groups)
     joined = {**ports, "measured": itertools.chain.from_iterable(ports.values())}
     return {JOINTS: {port: [_JOINT + name for name in names] for port, names in joined.items()}, **WRENCHES}
+
+
+def schemas_of(vectors: Iterable[str]) -> dict[str, str]:
+    """Topics that are read -> the schema of their messages. vectors: topics of vectors."""
+    kinds: dict[str, type[Message]] = {HEALTH: Health, OPERATOR: OperatorCommand, PACKETS: OperatorPackets}
+    kinds |= {topic_of(port): kind for port, kind, _ in FRAMES.values()}
+    kinds |= {topic: Wrench for topic in vectors if topic != JOINTS}
+    out = {topic: proto_class(kind).DESCRIPTOR.full_name for topic, kind in kinds.items()}
+    return (
+        out | {JOINTS: JointStates.DESCRIPTOR.full_name} | dict.fromkeys(IMAGES, CompressedImage.DESCRIPTOR.full_name)
+    )
 
 
 class Track:
@@ -75,7 +89,7 @@ class Recording:
     joined: the same of the ports of the recorder that join several (signals.JOINED).
     requests: the program's own commands. packets: what operators have sent.
     groups: the joints of the robot that was recorded.
-    Raises ConfigError if the log lacks something that the stages read.
+    Raises ConfigError if the log lacks something that the stages read, or holds it in another schema.
     """
 
     def __init__(self, log: LogReader, groups: Groups):
@@ -87,6 +101,11 @@ class Recording:
         needed = {HEALTH, OPERATOR, *topics, *CONSUMERS}
         if missing := sorted(needed - {name for name, topic in log.topics.items() if topic.count > 0}):
             raise ConfigError(f"{log.path} cannot be replayed: it has no messages of {', '.join(missing)}")
+        for topic, schema in schemas_of(topics).items():
+            if topic in log.topics and log.topics[topic].schema != schema:
+                raise ConfigError(
+                    f"{log.path}: {topic} holds {log.topics[topic].schema or 'no messages'}, not {schema}"
+                )
         images = set()  # topic, time
         vectors: dict[str, list[Record]] = {topic: [] for topic in topics}
         for record in log.records(needed | ({PACKETS, *IMAGES} & log.topics.keys())):
@@ -117,15 +136,19 @@ class Recording:
         return self._log.decode(record)
 
     def frame(self, time: float, header: CameraFrame) -> CameraFrame:
-        """The frame with its image, as recorded at `time`."""
+        """The frame with its image, as recorded at `time`. Raises ConfigError if the log does not hold it."""
         if header.sequence < 0:
             return header
         for _, _, recorded in self._log.messages([f"/{header.camera}/image"], time, time):
             message: Any = recorded
             stamp = message.timestamp
             if stamp.seconds * NANO + stamp.nanos == nanoseconds(header.time):
-                data = message.data
-                return CameraFrame(header.camera, header.time, header.sequence, decode_image(data), data)
+                try:
+                    image = decode_image(message.data)
+                except ValueError as error:
+                    words = f"{error}: of {header.camera} at t = {time:.3f} s"
+                    raise ConfigError(f"{self._log.path} holds {words}") from error
+                return CameraFrame(header.camera, header.time, header.sequence, image, message.data)
         raise ConfigError(f"{self._log.path} holds another image of {header.camera} at t = {time:.3f} s")
 
     def _add_vectors(self, records: list[Record], ports: Mapping[str, Sequence[str]]) -> None:
@@ -153,7 +176,7 @@ class Recording:
         """Every tick is in JOINTS: the first one that is missing tells where something was lost."""
         times = self.tracks["base.odometry"].times
         count = next((k for k, time in enumerate(times) if time != k * TICK), len(times))
-        damaged = self._log.damage or self._log.metadata.get("recovered", {}).get("damage")
+        damaged = self._log.damage or self._log.past_damage
         last = count - 1 - bool(damaged or count < len(times))  # of the last tick before a loss some may be missing
         if last < 0:
             raise ConfigError(f"{self._log.path} has no tick that is whole")
