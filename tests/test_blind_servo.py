@@ -17,6 +17,7 @@ from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, inverse, make, planar, rotation
 from valve_drake.messages import SIDES, CameraFrame, GraspPlan, Mode, ModeState, RobotState
 from valve_drake.ports import TICK
+from valve_drake.rehearsal import make_twin
 from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
 from valve_drake.stations.scene import panel_pose
@@ -167,3 +168,5 @@ def test_wrist_cameras_are_asked_for_where_the_hands_are_servoed_by_them(tmp_pat
         diagram.robot_of(dc.replace(scenario, robot=str(tmp_path / "seeing.robot.yaml")))
     with pytest.raises(ConfigError, match="cameras.left_wrist must be given for station hardware, got ''"):
         diagram.robot_of(dc.replace(scenario, station="hardware"))
+    with pytest.raises(ConfigError, match="cameras.left_wrist must be given for station hardware, got ''"):
+        make_twin(scenario)  # it would wait for their first images for ever

@@ -74,6 +74,15 @@ def test_pair_gives_the_pose_within_its_covariance(photos, capsys):
         assert np.abs(np.array(said["corners_px"][side]) - lens.project(P[:, :2] / P[:, 2:])).max() < 0.2
 
 
+def test_a_calibration_whose_residual_leaves_everything_open_is_named_by_it(photos, capsys, tmp_path):
+    vague = tmp_path / "vague.yaml"
+    vague.write_text(CALIBRATION.read_text() + "rms_px: 200.0\n")
+    pair = (photos / "left.png", photos / "right.png")
+    code, _, err = run(capsys, *pair, *given(vague))
+    assert code == 2 and "rms_px of the calibration must be at most 30 for two images, got 200.0" in err
+    assert run(capsys, pair[0], *given(vague))[0] == 0  # one camera has no epipolar line
+
+
 def test_one_camera_alone_left_or_right(photos, capsys):
     X_RV = frames.compose(frames.inverse(HEAD.X_LR), X_LV)
     for arguments, side, X in (

@@ -1,5 +1,6 @@
 """twin: the robot at the other end of the wire, its guard, its faults, and whole runs against it."""
 
+import dataclasses as dc
 import json
 import math
 import os
@@ -192,6 +193,18 @@ def test_a_fault_begins_with_its_mode_and_lasts_for_its_duration():
     faults.enter("turn", 62.5)  # again: it is the first entry that counts
     acting = [time for time in (60.9, 61.0, 62.9, 63.0) if faults.acts("nan", "left_arm", time)]
     assert acting == [61.0, 62.9] and not faults.acts("nan", "right_arm", 61.0)
+
+
+def test_a_joint_that_sticks_again_does_so_where_it_is_then():
+    first = FaultConfig(kind="stuck", device="left_arm", joint=1, start=1.0, duration=1.0)
+    faults = Faults([first, dc.replace(first, start=5.0)], 0)
+
+    def joint(time, measured):
+        return faults.stuck("left_arm", time, np.full(3, 9.0), np.full(3, measured)).tolist()
+
+    assert joint(1.0, 0.3) == joint(1.5, 0.4) == [9.0, 0.3, 9.0]
+    assert joint(3.0, 0.5) == [9.0, 9.0, 9.0]
+    assert joint(5.0, 0.7) == joint(5.5, 0.8) == [9.0, 0.7, 9.0]
 
 
 def test_a_restarted_device_is_silent_and_then_its_clock_begins_anew():

@@ -62,7 +62,7 @@ def make_twin(
     lcm: DrakeLcm | None = None,
 ) -> Twin:
     """The twin of a resolved scenario. workers: make its images; LiveImages, and their rate, to keep real time."""
-    robot = robot_of(scenario)
+    robot = robot_of(dc.replace(scenario, station="hardware"))  # the program at the other end takes no others
     for k, fault in enumerate(scenario.faults):
         if fault.kind == "stuck":
             last = robot.groups.size(fault.device) - 1

@@ -14,7 +14,7 @@ import numpy as np
 
 from valve_drake import frames
 from valve_drake.camera.lens import LensModel, StereoHead
-from valve_drake.checks import ConfigError
+from valve_drake.checks import ConfigError, require
 from valve_drake.messages import CameraFrame, QuadEdges, RectangleEstimate, Segmentation, SegmentationPair
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segmented
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_pair
@@ -26,6 +26,7 @@ from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig,
 _SIDES = ("left", "right")
 _MOST_OTHERS = 8  # further rectangles that are looked for; each costs as much as the first
 _SLACK = 3.0  # by how many rms of its calibration a head may be off
+_MAX_YAW_SIGMA, _MAX_GATE = 0.2, 90.0  # beyond, such a head says nothing of where the marker is [rad], [px]
 
 
 @dc.dataclass(frozen=True)
@@ -55,9 +56,12 @@ class _Stages:
 
     @classmethod
     def of(cls, cameras: StereoHead | LensModel, images: int, size: tuple[float, float], method: str) -> "_Stages":
-        """Raises ConfigError for an impossible marker."""
+        """Raises ConfigError for an impossible marker, or a calibration that says nothing."""
         head = cameras if isinstance(cameras, StereoHead) else StereoHead(cameras, cameras, np.eye(3, 4))
         slack = _SLACK * head.rms_px if images == 2 else 0.0
+        most = min(_MAX_YAW_SIGMA * head.right.focal(), _MAX_GATE) / _SLACK
+        known = images == 1 or head.rms_px <= most
+        require(known, "rms_px of the calibration", f"at most {most:.3g} for two images", head.rms_px)
         stages = cls(
             head=head,
             images=images,

@@ -87,6 +87,7 @@ class Faults:
                 yield fault, draw
 
     def acts(self, kind: str, device: str, time: float) -> bool:
+        """Whether a fault of this kind acts on the device now."""
         return any(True for _ in self._acting(kind, device, time))
 
     def silent(self, device: str, time: float) -> bool:
@@ -107,9 +108,13 @@ class Faults:
 
     def stuck(self, device: str, time: float, command: np.ndarray, measured: np.ndarray) -> np.ndarray:
         """A position command (n,) with the stuck joints where they stand."""
-        for fault, _ in self._acting("stuck", device, time):
+        now = {fault.joint for fault, _ in self._acting("stuck", device, time)}
+        for joint in {fault.joint for fault in self._faults if fault.kind == "stuck"} - now:
+            self._kept.pop(f"{device} {joint}", None)  # it may have moved when it sticks again
+        if now:
             command = command.copy()
-            command[fault.joint] = self._kept.setdefault(f"{device} {fault.joint}", measured[fault.joint])
+        for joint in now:
+            command[joint] = self._kept.setdefault(f"{device} {joint}", measured[joint])
         return command
 
     def arrivals(self, device: str, time: float) -> list[float]:
@@ -135,6 +140,7 @@ class Wire:
         self._waiting: list[tuple[float, str, Any]] = []
 
     def put(self, key: str, message: Any, time: float) -> None:
+        """A message sent at `time` on the channel `key`."""
         for when in self._faults.arrivals(CHANNELS[key].device, time):
             self._waiting.append((when, key, message))
 
