@@ -18,6 +18,7 @@ from robot_facts import GROUPS, ROBOT, robot_state
 from valve_drake import frames, profiling, resources
 from valve_drake import messages as ms
 from valve_drake.camera.lens import load_head
+from valve_drake.checks import ConfigError
 from valve_drake.ports import TICK
 from valve_drake.recording import foxglove
 from valve_drake.recording.layout import PLOTS, VISIBLE_3D, layout
@@ -386,6 +387,15 @@ def test_scene_draws_drakes_shapes_in_their_frames(tmp_path):
     assert sphere.size.y == 4
     assert len(mesh.points) == 4 and len(mesh.indices) == 12
     assert max(p.z for p in mesh.points) == 2.0
+
+
+def test_scene_names_a_mesh_that_cannot_be_read_in_one_line(tmp_path):
+    obj = tmp_path / "damaged.obj"
+    obj.write_text("")
+    part = ("world", Mesh(str(obj), 1.0), np.eye(3, 4), (1.0, 0.0, 0.0, 1.0))
+    with pytest.raises(ConfigError, match="^mesh .*damaged.obj cannot be read: ") as error:
+        scene([part])
+    assert "\n" not in str(error.value)
 
 
 # ---- layout

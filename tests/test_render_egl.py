@@ -2,6 +2,7 @@
 
 import gc
 import math
+import re
 
 import cv2
 import numpy as np
@@ -30,6 +31,7 @@ from robot_facts import ROBOT
 
 from valve_drake import named_files, resources, scenario
 from valve_drake.camera.lens import Lens, load_head
+from valve_drake.checks import ConfigError
 from valve_drake.perception.color_segmentation import ColorSegmentationConfig, segment
 from valve_drake.perception.line_fitting import LineFittingConfig, fit_quads
 from valve_drake.perception.quadrilateral import meet, side_lines
@@ -241,6 +243,46 @@ def test_a_mesh_without_materials_takes_the_property_and_one_with_them_its_own(t
     image = draw([(Mesh(str(tmp_path / "two.obj"), 0.2), at(0, 0, 1), (0.0, 0.0, 1.0, 1.0))])
     assert image[118, 130, 0] > 100 and image[118, 130, 2] == 0
     assert image[118, 260, 2] > 100 and image[118, 260, 0] == 0
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        TRIANGLE + "f 1 2 3 # the only one\n",
+        "# tabs and blanks\n" + TRIANGLE.replace(" ", "\t") + "  f\t1  2 3\n",
+        TRIANGLE + "f 1 2 \\\n3\n",
+        TRIANGLE + "f -3 -2 -1\nv 5 5 5\n",  # counts back from what was read until then
+        "v 9 9 9\n" + TRIANGLE + "vn 0 0 1\nf -3//-1 -2//-1 -1//-1\nvn 1 0 0\n",
+    ],
+)
+def test_a_mesh_is_the_same_however_it_is_written(tmp_path, text):
+    (tmp_path / "a.obj").write_text(text)
+    points, normals, _, corners = read_obj(str(tmp_path / "a.obj"), 0.0)
+    assert points[corners].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]] and (normals[corners] == [0, 0, 1]).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (TRIANGLE + "f 1 2 9\n", "a face has corner 9, there are 3"),
+        (TRIANGLE + "f 0 1 2\n", "a face has corner 0"),
+        (TRIANGLE + "f -4 -2 -1\n", "a face has corner 0"),
+        (TRIANGLE + "vn 0 0 1\nf 1//1 2//1 3//2\n", "a face has corner 2, there are 1"),
+        (TRIANGLE + "f a b c\n", "invalid literal"),
+        ("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "a line `v` has no three finite numbers"),
+        (TRIANGLE.replace("1", "nan") + "f 1 2 3\n", "a line `v` has no three finite numbers"),
+        ("mtllib a.mtl\n" + TRIANGLE + "f 1 2 3\n", "could not convert string to float: 'r'"),
+    ],
+)
+def test_a_damaged_mesh_is_one_line_that_names_the_file(tmp_path, text, says):
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd r g b\n")
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(ConfigError, match=f"^mesh .*a.obj cannot be read: .*{re.escape(says)}") as error:
+        draw([(Mesh(str(tmp_path / "a.obj"), 1.0), at(0, 0, 1), (0.0, 0.0, 1.0, 1.0))])
+    assert "\n" not in str(error.value)
 
 
 def test_corners_that_triangles_share_are_held_once_and_a_mirrored_mesh_is_seen_from_outside(tmp_path):

@@ -11,6 +11,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from pydrake.geometry import Box, Cylinder, Mesh, ReadObjToTriangleSurfaceMesh, Role, SceneGraphInspector, Shape, Sphere
 
+from valve_drake.checks import ConfigError
 from valve_drake.recording.foxglove import pose, stamp
 
 GREY = (0.7, 0.7, 0.7, 1.0)
@@ -35,7 +36,8 @@ def parts_of(inspector: SceneGraphInspector) -> list[Part]:
 def scene(parts: Iterable[Part], time: float = 0.0) -> SceneUpdate:
     """All parts, each drawn in its frame and moving with it, until further notice.
 
-    Boxes, spheres, cylinders and .obj meshes; other shapes have no counterpart and are left out.
+    Boxes, spheres, cylinders and .obj meshes; other shapes have no counterpart and are left out. Raises ConfigError for
+    a mesh that cannot be read.
     """
     update, entities = SceneUpdate(), {}
     read = functools.cache(_read)  # several parts have the same mesh
@@ -66,8 +68,11 @@ ReadMesh = Callable[[str, tuple[float, ...]], tuple[list[Point3], list[int]]]
 
 
 def _read(path: str, scale: tuple[float, ...]) -> tuple[list[Point3], list[int]]:
-    """Vertices of an OBJ's triangles, and three indices a triangle."""
-    mesh = ReadObjToTriangleSurfaceMesh(path, np.array(scale))
+    """Vertices of an OBJ's triangles, and three indices a triangle. Raises ConfigError naming the file."""
+    try:
+        mesh = ReadObjToTriangleSurfaceMesh(path, np.array(scale))
+    except RuntimeError as error:
+        raise ConfigError(f"mesh {path} cannot be read: {str(error).splitlines()[0]}") from error
     points = [Point3(x=x, y=y, z=z) for x, y, z in np.array(mesh.vertices()).tolist()]
     return points, [triangle.vertex(k) for triangle in mesh.triangles() for k in range(3)]
 

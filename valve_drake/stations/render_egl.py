@@ -15,6 +15,7 @@ import dataclasses as dc
 import functools
 import math
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,8 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
 
+from valve_drake.checks import ConfigError
+
 SEGMENTS = 48  # of round shapes, as in RenderEngineVtk; raise it where a rim looks angular
 MAX_LIGHTS = 4
 FINE = ("valve_drake", "fine_within")  # perception property: farther off, one point a pixel will do [m]
@@ -52,6 +55,8 @@ _MOST = 0.3  # of a picture; where its fine parts are larger, all of it at once 
 _SMOOTHING = 0.45  # standard deviation of the blur of what has one point a pixel, against stepped edges [px]
 _BUSY = 2.4  # mean step between neighbours [grey levels]; in a picture with more edges their errors add up to a tenth
 _CLIP_DISTANCE = 0x3000  # GL_CLIP_DISTANCE0, which moderngl has no name for
+
+_COMMENT = re.compile(r"(?m)(^|\s)#.*$")
 
 _VERTEX_SHADER = """
 #version 330
@@ -556,15 +561,24 @@ def _turned(profile: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, n
 def read_obj(path: str, modified: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Points, normals and colours (m, 3) of the corners of an OBJ's triangles, and (3n,) which corner is where.
 
-    Normals are flat where it has none; colours are NaN where its material library says none (Kd).
+    Normals are flat where it has none; colours are NaN where its material library says none (Kd). modified: when the
+    file was, so that another one of that name is read again. Raises ConfigError naming the file if it is damaged.
     """
+    try:
+        return _parse_obj(Path(path))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"mesh {path} cannot be read: {error}") from error
+
+
+def _parse_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """As `read_obj`. Raises ValueError for a damaged file."""
     points: list[str] = []
     normals: list[str] = []
     faces: list[str] = []
     colors: list[tuple[float, ...]] = []
     color: tuple[float, ...] = (np.nan,) * 3
     materials: dict[str, tuple[float, ...]] = {}
-    for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in _lines(path):
         word, _, rest = line.partition(" ")
         if word == "v":
             points.append(rest)
@@ -572,17 +586,18 @@ def read_obj(path: str, modified: float) -> tuple[np.ndarray, np.ndarray, np.nda
             normals.append(rest)
         elif word == "f":
             corners = rest.split()
+            if "-" in rest:
+                corners = [_from_the_first(corner, len(points), len(normals)) for corner in corners]
             for k in range(1, len(corners) - 1):  # a fan of triangles
                 faces += (corners[0], corners[k], corners[k + 1])
                 colors.append(color)
         elif word == "mtllib":
-            materials |= _materials(Path(path).parent / rest.strip())
+            materials |= _materials(path.parent / rest.strip())
         elif word == "usemtl":
             color = materials.get(rest.strip(), (np.nan,) * 3)
     if not faces:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int)
-    P = np.array(" ".join(" ".join(row.split()[:3]) for row in points).split(), float).reshape(-1, 3)
-    N = np.array(" ".join(normals).split(), float).reshape(-1, 3)
+    P, N = _vectors(points, "v"), _vectors(normals, "vn")
     distinct: dict[str, int] = {}
     order = np.array([distinct.setdefault(corner, len(distinct)) for corner in faces])
     parts = [(corner.split("/") + ["", ""])[:3] for corner in distinct]
@@ -598,17 +613,44 @@ def read_obj(path: str, modified: float) -> tuple[np.ndarray, np.ndarray, np.nda
     return out, flat, np.repeat(np.array(colors), 3, axis=0), np.arange(len(out))
 
 
+def _lines(path: Path) -> list[str]:
+    """The lines of an OBJ or its material library: comments left out, continued ones joined, blanks for tabs."""
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\t", " ").replace("\\\n", " ")
+    if "#" in text:
+        text = _COMMENT.sub("", text)
+    return [line.strip() for line in text.splitlines()]
+
+
+def _vectors(rows: list[str], word: str) -> np.ndarray:
+    """The first three numbers of each row (n, 3). Raises ValueError."""
+    numbers = np.array(" ".join(" ".join(row.split()[:3]) for row in rows).split(), float)
+    if numbers.size != 3 * len(rows) or not np.isfinite(numbers).all():
+        raise ValueError(f"a line `{word}` has no three finite numbers")
+    return numbers.reshape(-1, 3)
+
+
+def _from_the_first(corner: str, points: int, normals: int) -> str:
+    """A face's corner, POINT/TEXTURE/NORMAL, whose negative numbers count back from what was read last."""
+    parts = corner.split("/")
+    for k, count in ((0, points), (2, normals)):
+        if k < len(parts) and parts[k].startswith("-"):
+            parts[k] = str(int(parts[k]) + count + 1)
+    return "/".join(parts)
+
+
 def _index(text: str, count: int) -> int:
-    """OBJ counts from 1, and from the end backwards."""
+    """OBJ counts from 1. Raises ValueError."""
     k = int(text)
-    return k - 1 if k > 0 else count + k
+    if not 1 <= k <= count:
+        raise ValueError(f"a face has corner {k}, there are {count}")
+    return k - 1
 
 
 def _materials(path: Path) -> dict[str, tuple[float, ...]]:
-    """Diffuse colours by material name; none where the library is missing."""
+    """Diffuse colours by material name; none where the library is missing. Raises ValueError."""
     out: dict[str, tuple[float, ...]] = {}
     name = ""
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+    for line in _lines(path) if path.is_file() else ():
         words = line.split()
         if words[:1] == ["newmtl"]:
             name = " ".join(words[1:])
