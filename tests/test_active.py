@@ -153,3 +153,10 @@ def test_a_name_that_cannot_be_written_is_one_clear_line(tmp_path, name):
     with pytest.raises(ConfigError, match="cannot be written") as caught:
         LogWriter(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+def test_a_log_that_cannot_be_made_leaves_no_folder_and_no_open_file(tmp_path):
+    before = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(ConfigError, match="cannot be written: File name too long"):
+        LogWriter(tmp_path / "new" / "folder" / f"{'a' * 300}.mcap")
+    assert list(tmp_path.iterdir()) == [] and len(os.listdir("/proc/self/fd")) == before

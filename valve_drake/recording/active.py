@@ -31,18 +31,27 @@ class ActiveFile:
         parents = (path.parent, *path.parent.parents)
         self._made = list(itertools.takewhile(lambda folder: not os.path.exists(folder), parents))
         self._where: Path | None = None  # once it is closed
-        reasons = []
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            for self.path in _names(path):
-                self._overwrite = overwrite and self.path == path
-                reason = _taken(self.path, () if self._overwrite else ("", *companions)) or self._create()
-                if not reason:
-                    break
-                reasons.append(reason)
+            try:
+                self._claim(path, companions, overwrite)
+            except OSError:
+                os.close(self._folder)
+                raise
         except OSError as error:
+            self._remove_folders()
             raise ConfigError(f"log {str(path)!r} cannot be written: {error.strerror}") from None
+
+    def _claim(self, path: Path, companions: Sequence[str], overwrite: bool) -> None:
+        """Takes the first free name. Raises OSError."""
+        reasons = []
+        for self.path in _names(path):
+            self._overwrite = overwrite and self.path == path
+            reason = _taken(self.path, () if self._overwrite else ("", *companions)) or self._create()
+            if not reason:
+                break
+            reasons.append(reason)
         if reasons:
             self.note = f"{reasons[0]}: this log is {str(self.path)!r}"
 
@@ -98,6 +107,9 @@ class ActiveFile:
         if self._in_place():
             os.unlink(active(self.path).name, dir_fd=self._folder)
         self.close()
+        self._remove_folders()
+
+    def _remove_folders(self) -> None:
         for folder in self._made:
             with contextlib.suppress(OSError):  # something else has been put there
                 folder.rmdir()
