@@ -232,9 +232,15 @@ def test_a_disk_that_falls_far_behind_stops_the_log(tmp_path, monkeypatch):
     monkeypatch.setattr(writer, "MAX_BACKLOG", 100_000)
     monkeypatch.setattr(os, "fsync", lambda fd: go_on.wait(10))
     log = LogWriter(tmp_path / "a.mcap")
+    recorded = 0
     for topic, message, t in samples(5.0):
+        recorded += not log.error
         log.write(topic, message, t)
-    assert "behind" in log.error
+    assert "behind" in log.error and 100 < recorded < 1000
+    log.write_metadata("result", {"outcome": "done"})
     go_on.set()
     with pytest.raises(LogError, match="behind"):
         log.close()
+    found = LogReader(tmp_path / "a.mcap.active")  # all that was recorded until then, and no end
+    count = sum(topic.count for topic in found.topics.values())
+    assert recorded - 1 <= count <= recorded and "result" not in found.metadata

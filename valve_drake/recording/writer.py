@@ -9,7 +9,8 @@ the program, all but the last FLUSH_PERIOD of the log's own time can be read bac
 topics that it holds messages of, so that a damaged chunk never takes another one's meaning with it.
 
 When the disk refuses (full, gone) or falls MAX_BACKLOG behind, logging stops and the loop goes on: `error`
-says why, the next write tells Python's logging so, once, and closing raises LogError.
+says why, the next write tells Python's logging so, once, and closing raises LogError. A slow disk still gets what was
+recorded until then.
 """
 
 import dataclasses
@@ -128,7 +129,7 @@ class LogWriter:
             raise LogError(self._error)
 
     def _end(self, last: Callable[[], None]) -> None:
-        """Gives the thread `last` as its last job, and waits until it has ended."""
+        """Gives the thread `last` as its last job, unless logging has stopped, and waits until it has ended."""
         self._hand_over(0, last)
         self._jobs.put(None)
         self._thread.join()
@@ -166,6 +167,9 @@ class LogWriter:
             self._chunk = Chunk()
 
     def _hand_over(self, size: int, job: Callable[..., object], *args: Any) -> None:
+        """Gives the thread a job with so many bytes to write; nothing more once logging has stopped."""
+        if self._error:
+            return
         self._handed += size
         if self._handed - self._written > MAX_BACKLOG:
             self._stop(f"the disk is {MAX_BACKLOG >> 20} MiB behind")
@@ -182,13 +186,15 @@ class LogWriter:
         self._error = self._error or f"logging stopped: {reason}; {left}"
 
     def _work(self) -> None:
-        """The thread: does the jobs in their order, none after a failure."""
+        """The thread: does the jobs in their order, none after one that failed."""
+        failed = False
         while (handed := self._jobs.get()) is not None:
             size, job, args = handed
-            if not self._error:
+            if not failed:
                 try:
                     job(*args)
                 except Exception as error:  # whatever it is, it must not end the run
+                    failed = True
                     self._stop(_words(error))
             self._written += size
             self.spent = time.thread_time()
