@@ -13,7 +13,7 @@ import pytest
 
 from valve_drake import cli, yaml_file
 from valve_drake.checks import ConfigError
-from valve_drake.robot import drafting, packages, urdf
+from valve_drake.robot import drafting, packages, urdf, xml_file
 from valve_drake.robot.mending import mend
 
 HAS_TRIMESH = importlib.util.find_spec("trimesh") is not None and importlib.util.find_spec("collada") is not None
@@ -152,7 +152,7 @@ def test_a_file_that_cannot_be_used_is_refused_by_name_and_place(text, says):
 
 
 def test_a_file_that_is_too_large_is_refused_before_it_is_parsed(tmp_path, monkeypatch):
-    monkeypatch.setattr(urdf, "MAX_BYTES", 100)
+    monkeypatch.setattr(xml_file, "MAX_BYTES", 100)
     (tmp_path / "a.urdf").write_text(robot(link("a")) + " " * 100)
     with pytest.raises(ConfigError, match="a.urdf: larger than 0.0001 MB"):
         urdf.read(tmp_path / "a.urdf")

@@ -24,6 +24,7 @@ from valve_drake.scenario import load, resolve
 from valve_drake.stations.contract import check_contract, vectors
 
 OURS = description.find(description.OURS)
+PR2 = "pr2/pr2.robot.yaml"
 
 # ---------------------------------------------------------------- our own robot
 
@@ -230,8 +231,46 @@ def test_colors_paint_the_models_materials_over(tmp_path):
     for link in ("left_hand", "right_finger_1_link", "chest"):
         assert color(robot, link, "accent") == pytest.approx([0.1, 0.2, 0.3, 1.0])
         assert color(robot, link, "dark") == color(ROBOT, link, "dark")
-    pr2 = Robot.load(description.find("pr2/pr2.robot.yaml"))  # of a URDF: the finger tips, green in the file
-    assert color(pr2, "l_gripper_l_finger_tip_link", "1") == pytest.approx([0.5, 0.5, 0.5, 1.0])
+    other = Robot.load(description.find(PR2))  # of a URDF: the finger tips, green in the file
+    assert color(other, "l_gripper_l_finger_tip_link", "1") == pytest.approx([0.5, 0.5, 0.5, 1.0])
+
+
+def pr2(folder, edit):
+    """The robot.yaml of the PR2 with its URDF's text edited, in a folder."""
+    given = resources.models() / "pr2"
+    for path in given.iterdir():
+        (folder / path.name).symlink_to(path)
+    (folder / "pr2.urdf").unlink()
+    (folder / "pr2.urdf").write_text(edit((given / "pr2.urdf").read_text()))
+    return folder / "pr2.robot.yaml"
+
+
+def without_colors(path):
+    text = path.read_text()
+    path.unlink()  # a link to ours
+    path.write_text("".join(line for line in text.splitlines(keepends=True) if not line.startswith("colors:")))
+    return path
+
+
+@pytest.mark.parametrize("painted", [True, False])
+def test_a_urdf_with_a_prefix_that_it_does_not_declare_is_a_robot(tmp_path, painted):
+    """Drake reads it, and files for Gazebo have such prefixes."""
+    path = pr2(tmp_path, lambda text: text.replace("</robot>", "<gazebo><controller:x a='1'/></gazebo></robot>"))
+    assert Robot.load(path if painted else without_colors(path)).opening == Robot.load(description.find(PR2)).opening
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (lambda text: text[:3000], "pr2.urdf: not XML: unclosed token (line "),
+        (lambda text: "", "pr2.urdf: not XML: no element found"),
+        (lambda text: text.replace("<robot", "<!DOCTYPE robot><robot", 1), "a document type (<!DOCTYPE ...>) is not"),
+    ],
+)
+def test_a_damaged_model_whose_colours_are_changed_is_refused_in_one_line(tmp_path, edit, words):
+    with pytest.raises(ConfigError) as error:
+        Robot.load(pr2(tmp_path, edit))
+    assert words in str(error.value) and "\n" not in str(error.value) and "pr2.robot.yaml: model " in str(error.value)
 
 
 def test_pads_get_a_grid_of_contact_points_where_their_surfaces_are(tmp_path):
@@ -291,7 +330,7 @@ def test_a_fixed_base_hangs_on_the_world(tmp_path):
 
 
 def test_the_pr2_is_described_by_its_file():
-    robot = Robot.load(description.find("pr2/pr2.robot.yaml"))
+    robot = Robot.load(description.find(PR2))
     assert robot.posture.names == ("torso_lift_joint",) and robot.base.names == ("base_x", "base_y", "base_yaw")
     for side, y in ((LEFT, 1), (RIGHT, -1)):
         gripper, arm = robot.grippers[side], robot.arms[side]
@@ -437,7 +476,7 @@ WRONG = {
     "a weld of nothing": (at("weld", ["elbow"]), "weld[0] must be a joint of the model, got 'elbow'"),
     "a colour of no material": (
         at("colors", {"accents": [0, 0, 0, 1]}),
-        "colors.accents must be a material of the model, got 'accents'; near it: accent",
+        "robot.yaml: colors.accents must be a material of the model, got 'accents'; near it: accent",
     ),
     "a colour of 8 bits": (at("colors", {"accent": [255, 0, 0, 255]}), "colors.accent[0] must be within [0, 1]"),
     "a pad in millimeters": (at("pad", {"size": [22, 16]}), "pad.size[0] must be within [0, 0.1], got 22"),

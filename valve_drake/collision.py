@@ -1,7 +1,6 @@
 """Do the arms touch anything? A model of robot, valve and panel for planning, apart from the simulated plant."""
 
 import math
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -18,10 +17,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from valve_drake.checks import ConfigError, shown
+from valve_drake.checks import shown
 from valve_drake.frames import compose, inverse
 from valve_drake.messages import SIDES
-from valve_drake.robot import description
+from valve_drake.robot import description, xml_file
 from valve_drake.robot.robot import Robot
 from valve_drake.valve.valve import turned
 
@@ -39,12 +38,9 @@ def stem_angle(X_BA: np.ndarray) -> float:
 
 def srdf_pairs(path: Path) -> set[tuple[str, str]]:
     """The pairs of links that an SRDF file says need no check. Raises ConfigError if it is no such file."""
-    try:
-        found = list(ElementTree.parse(path).getroot().iter("disable_collisions"))
-    except (OSError, ElementTree.ParseError, ValueError) as error:
-        raise ConfigError(
-            f"collision.srdf must be an SRDF file, got {shown(path.name)}: {shown(str(error))}"
-        ) from error
+    found = xml_file.read(path, f"collision.srdf must be an SRDF file, got {shown(path.name)}").iter(
+        "disable_collisions"
+    )
     return {(pair.get("link1", ""), pair.get("link2", "")) for pair in found}
 
 

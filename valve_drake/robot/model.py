@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses as dc
 import difflib
-import xml.etree.ElementTree as ElementTree
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -28,7 +28,7 @@ from pydrake.multibody.tree import (
 from valve_drake import resources
 from valve_drake.checks import ConfigError, shown
 from valve_drake.messages import SIDES
-from valve_drake.robot import packages
+from valve_drake.robot import packages, xml_file
 from valve_drake.robot.description import RobotDescription, model_file
 from valve_drake.robot.pads import PadPoints, add_points, contact_points
 from valve_drake.robot.paint import painted
@@ -66,6 +66,8 @@ def parse(
             models = parser.AddModelsFromString(painted(path, colors), kind)
         else:
             models = parser.AddModels(str(path))
+    except ConfigError:
+        raise
     except (RuntimeError, ValueError) as error:
         raise ConfigError(f"model {path} cannot be read: {_first(str(error))}") from error
     if len(models) != 1:
@@ -314,7 +316,7 @@ def _file_joints(path: Path) -> Iterator[tuple[str, float | None, Mimic | None]]
     """Name, effort limit and mimic of every joint of an SDF or URDF file, as they are written."""
     if path.suffix.lower() not in (".sdf", ".urdf", ".xml"):
         return
-    for joint in ElementTree.parse(path).getroot().iter("joint"):
+    for joint in xml_file.read(path, f"model {path}").iter("joint"):
         name = joint.get("name")
         if name is None:  # within a URDF transmission
             continue
@@ -327,11 +329,11 @@ def _file_joints(path: Path) -> Iterator[tuple[str, float | None, Mimic | None]]
             raise ConfigError(f"model {path}: joint {shown(name)} has a limit or mimic that is no number") from error
 
 
-def _mimic(name: str, joint: ElementTree.Element) -> Mimic | None:
+def _mimic(name: str, joint: ET.Element) -> Mimic | None:
     for element in joint.iter():
-        if element.tag.rpartition("}")[2].rpartition(":")[2] == "mimic" and (follows := element.get("joint")):
+        if element.tag.rpartition(":")[2] == "mimic" and (follows := element.get("joint")):
 
-            def value(key: str, default: str, element: ElementTree.Element = element) -> float:
+            def value(key: str, default: str, element: ET.Element = element) -> float:
                 return float(element.get(key) or element.findtext(key) or default)
 
             return Mimic(name, follows, value("multiplier", "1"), value("offset", "0"))

@@ -1,22 +1,18 @@
-"""Reading and checking a URDF: XML without entities, and the tree of links and joints that it describes.
+"""Reading and checking a URDF: the tree of links and joints that it describes.
 
-A file that cannot be used is refused in one line that names the file, the element and the value. Prefixes of names
-(`controller:x` in what Gazebo reads) are part of the name, declared or not.
+A file that cannot be used is refused in one line that names the file, the element and the value.
 """
 
 import dataclasses as dc
 import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from xml.parsers import expat
 
 import numpy as np
 
 from valve_drake.checks import ConfigError, shown
+from valve_drake.robot import xml_file
 
-MAX_BYTES = 16_000_000  # of a file; the largest robot descriptions have 1 MB
-MAX_ELEMENTS = 200_000  # of a file
-MAX_DEPTH = 64  # of nested elements
 MAX_LENGTH = 10.0  # of a joint's origin or a mesh: beyond it the numbers are millimetres [m]
 MOVING = ("revolute", "continuous", "prismatic")
 _TYPES = (*MOVING, "fixed", "floating", "planar")
@@ -128,20 +124,12 @@ class Robot:
 
 def read(path: Path) -> Robot:
     """The robot that a file describes. Raises ConfigError, one line."""
-    source = path.name
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise ConfigError(f"{shown(str(path))}: cannot be read ({error.strerror})") from error
-    if len(data) > MAX_BYTES:
-        raise ConfigError(f"{source}: larger than {MAX_BYTES / 1e6:g} MB")
-    return parse(data, source)
+    return parse(xml_file.load(path, path.name), path.name)
 
 
 def parse(data: bytes, source: str) -> Robot:
     """The robot that a URDF's bytes describe. Raises ConfigError, one line that begins with `source`."""
-    element = parse_xml(data, source)
+    element = xml_file.parse(data, source)
     if element.tag != "robot":
         hint = _OTHERS.get(element.tag, "a URDF begins with <robot>")
         raise ConfigError(f"{source}: its root element is <{element.tag[:40]}>: {hint}")
@@ -169,44 +157,6 @@ def parse(data: bytes, source: str) -> Robot:
     robot = Robot(element, source, name, links, joints, _root(links, joints, source))
     _check_numbers(robot)
     return robot
-
-
-def parse_xml(data: bytes, source: str) -> ET.Element:
-    """The root element. Raises ConfigError: not XML, a document type (so any entity), too deep, too many elements."""
-    builder, depth, count = ET.TreeBuilder(), 0, 0
-    parser = expat.ParserCreate()
-    parser.buffer_text = True
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth, count
-        depth, count = depth + 1, count + 1
-        if depth > MAX_DEPTH or count > MAX_ELEMENTS:
-            raise ConfigError(
-                f"{source}: line {parser.CurrentLineNumber}: more than {MAX_DEPTH} levels or {MAX_ELEMENTS} elements"
-            )
-        builder.start(tag, attributes)
-
-    def end(tag: str) -> None:
-        nonlocal depth
-        depth -= 1
-        builder.end(tag)
-
-    def refuse(*_: object) -> None:
-        raise ConfigError(f"{source}: line {parser.CurrentLineNumber}: a document type (<!DOCTYPE ...>) is not read")
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler = builder.data
-    parser.StartDoctypeDeclHandler = refuse
-    try:
-        parser.Parse(data, True)
-        return builder.close()
-    except expat.ExpatError as error:
-        what = expat.ErrorString(error.code)
-        raise ConfigError(f"{source}: not XML: {what} (line {error.lineno}, column {error.offset + 1})") from error
-    except (ValueError, LookupError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{source}: not XML: {error}") from error
 
 
 def numbers(element: ET.Element | None, key: str, count: int, default: tuple[float, ...]) -> np.ndarray:
