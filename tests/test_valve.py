@@ -7,6 +7,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 from robot_facts import ROBOT
 
+from valve_drake import resources
 from valve_drake import scenario as scenarios
 from valve_drake.behaviors.stance_config import StanceConfig
 from valve_drake.behaviors.stance_search import Stances
@@ -68,6 +69,10 @@ WRONG = {
     HANDLES % "{xyz: [0.15, 0, 0]}, {xyz: [0.14, 0.05, 0]}": "valve.handles must be two of them at least 0.12 m apart",
     HANDLES % "{xyz: [0.15, 0, 0]}, {xyz: [0.15, 0, -0.2]}": "two of them at least 0.12 m apart across the axis",
     HANDLES % "{xyz: [0.15, 0, 0], kind: rim}, {xyz: [-0.2, 0, 0], kind: rim}": "as far from the axis as all others",
+    HANDLES
+    % "{xyz: [0.2, 0, 0], kind: rim}, {xyz: [-0.2, 0, 0.05], kind: rim}": "as high over the panel (z) as all others",
+    HANDLES
+    % "{xyz: [0.2, 0, 0], kind: rim}, {xyz: [-0.2, 0, 0], kind: rim, width: 0.04}": "as wide as all others on the",
     "valve: {handles: 3}": "valve.handles must be a list",
     "valve: {panel: {depth: -1}}": "valve.panel.depth must be within",
     "valve: {obstacles: [{size: [1, 1]}]}": "valve.obstacles[0].size must be 3 values",
@@ -86,6 +91,7 @@ MODELS = {
     "valve: {model: robot/robot.sdf}": "valve.model: stem must be a joint of the model",
     "valve: {handles: [{xyz: [0.2, 0, 0]}, {xyz: [-0.15, 0, 0]}]}": "valve.handles[0].xyz must be where valve.model",
     "valve: {marker: {xyz: [0.06, 0, -0.041]}}": "valve.marker.xyz must be where valve.model has its frame marker",
+    "valve: {marker: {rpy: [0.5, 0, 0]}}": "valve.marker.rpy must be as valve.model has its frame marker, [0.0, ",
     PANEL % "[0, -0.23, 0.085]": "valve.marker.carrier must be where valve.model has its frame marker, wheel",
     "valve: {panel: {depth: 0.12}}": "where valve.model has its frame",
 }
@@ -96,6 +102,43 @@ def test_a_model_that_contradicts_the_keys_is_refused_in_one_line(text):
     with pytest.raises(ConfigError) as error:
         add_valve(MultibodyPlant(0.0), valve(text))
     assert MODELS[text] in str(error.value) and "\n" not in str(error.value)
+
+
+STEM = '<joint name="stem" type="revolute">'
+HANGS = '<joint name="bolts" type="fixed"><parent>world</parent><child>panel</child></joint></model>'
+BUILT = {
+    "a stem that does not turn": ("revolute", "fixed", "joint stem is revolute, from the link panel to the link wheel"),
+    "a stem that slides": ("revolute", "prismatic", "joint stem is revolute, from the link panel to the link wheel"),
+    "a stem that turns the other way": ("<xyz>0 0 -1</xyz>", "<xyz>0 0 1</xyz>", "stem turns about -z of the link"),
+    "a stem that lies across": ("<xyz>0 0 -1</xyz>", "<xyz>1 0 0</xyz>", "stem turns about -z of the link panel"),
+    "a stem beside the axis": (STEM, f"{STEM}<pose>0.05 0 0 0 0 0</pose>", "stem turns about -z of the link panel"),
+    "a stem that nothing drives": ("<effort>5.1</effort>", "<effort>0</effort>", "joint stem has an actuator of its"),
+    "a wheel that stands turned": (
+        "<pose>0 0 0 0 0 0</pose>",
+        "<pose>0 0 0.02 0 0 0.3</pose>",
+        "links panel and wheel share a frame with the stem at zero",
+    ),
+    "a panel that hangs on the world": ("</model>", HANGS, "link panel hangs on nothing: the scene puts it anywhere"),
+}
+
+
+@pytest.mark.parametrize("case", BUILT)
+def test_a_model_that_is_put_together_otherwise_is_refused_in_one_line(tmp_path, case):
+    old, new, words = BUILT[case]
+    text = (resources.models() / "valve" / "valve.sdf").read_text()
+    assert old in text
+    text = text.replace("../meshes/", "package://valve_drake_models/meshes/").replace(old, new, 1)
+    (tmp_path / "mine.sdf").write_text(text)
+    with pytest.raises(ConfigError) as error:
+        Robot.load(OURS, valve(f"valve: {{model: {tmp_path}/mine.sdf}}"))
+    line = str(error.value)
+    assert line.startswith("valve.model must be one whose ") and words in line and "\n" not in line
+
+
+def test_a_model_that_is_damaged_is_refused_by_its_key_and_not_the_robots(tmp_path):
+    (tmp_path / "mine.sdf").write_text("<sdf version='1.9'><model name='valve'>")
+    with pytest.raises(ConfigError, match=r"^valve.model: model .*mine.sdf cannot be read: [^\n]*$"):
+        Robot.load(OURS, valve(f"valve: {{model: {tmp_path}/mine.sdf}}"))
 
 
 def test_grasps_run_along_the_handle_and_close_across_it():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Box, Cylinder, ProximityProperties, Shape
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
@@ -25,7 +25,7 @@ from valve_drake import resources
 from valve_drake.checks import ConfigError, require
 from valve_drake.frames import compose, inverse, make, rot_z
 from valve_drake.robot.description import find_package_file
-from valve_drake.robot.model import frame_named, joint_named, parse
+from valve_drake.robot.model import frame_named, joint_named, parent_joint, parse
 from valve_drake.valve.valve import Valve
 
 RED, GREEN = (0.80, 0.06, 0.05, 1.0), (0.05, 0.55, 0.15, 1.0)
@@ -48,21 +48,13 @@ def add_valve(plant: MultibodyPlant, valve: Valve, X_VM: np.ndarray | None = Non
 
     Raises ConfigError: a file that cannot be read, a link or frame that it lacks or has elsewhere.
     """
-    if valve.model:
-        model = parse(plant, _file(valve.model))
-        joint_named(plant, model, "stem", "valve.model: stem")
-    else:
-        model = _made(plant, valve)
-    axis = frame_named(plant, model, "valve_axis", "valve.model: valve_axis")
-    wheel = frame_named(plant, model, "wheel", "valve.model: wheel").body()
-    frame_named(plant, model, "panel", "valve.model: panel")
+    model = _read(plant, valve) if valve.model else _made(plant, valve)
+    wheel, panel = (plant.GetBodyByName(name, model) for name in ("wheel", "panel"))
     X_PA = inverse(valve.X_AP())
-    carrier = plant.GetBodyByName("panel", model) if valve.fixed else wheel  # of the marker
+    carrier = panel if valve.fixed else wheel  # of the marker
     # In the file the wheel's own frame is valve_axis, with the stem at zero.
     places = {f"handle_{k + 1}": make(np.eye(3), np.array(h.xyz)) for k, h in enumerate(valve.handles)}
     places["marker"] = valve.X_AV()
-    level = axis.GetFixedPoseInBodyFrame().IsNearlyIdentity(ON_MODEL) and axis.body().name() == "panel"
-    require(level, "valve.model", "one whose frame valve_axis is the link panel's own", valve.model)
     for name, X_AF in places.items():
         X_WheelF = compose(X_PA, X_AF)
         body = carrier if name == "marker" else wheel
@@ -80,9 +72,15 @@ def add_valve(plant: MultibodyPlant, valve: Valve, X_VM: np.ndarray | None = Non
                 f"where valve.model has its frame marker, {own}",
                 body.name(),
             )
-        same = np.abs(found - X_WheelF).max() < ON_MODEL
+        off = np.abs(found - X_WheelF).max(axis=0)
         place = np.round(compose(valve.X_AP(), found)[:, 3], 4).tolist()
-        require(bool(same), f"{key}.xyz", f"where valve.model has its frame {name}, {place}", X_AF[:, 3].tolist())
+        require(
+            off[3] < ON_MODEL, f"{key}.xyz", f"where valve.model has its frame {name}, {place}", X_AF[:, 3].tolist()
+        )
+        if name == "marker":
+            rpy = [round(angle, 4) + 0.0 for angle in RollPitchYaw(RotationMatrix(found[:, :3])).vector().tolist()]
+            turned = bool(off[:3].max() < ON_MODEL)
+            require(turned, f"{key}.rpy", f"as valve.model has its frame {name}, {rpy}", valve.marker.rpy)
     X_WheelM = compose(X_PA, valve.X_AV())
     if X_VM is not None:
         X_WheelM = compose(X_WheelM, X_VM)
@@ -90,9 +88,40 @@ def add_valve(plant: MultibodyPlant, valve: Valve, X_VM: np.ndarray | None = Non
     at = _rigid(compose(X_WheelM, make(np.eye(3), np.array([0, 0, STICKER / 2]))))
     plant.RegisterVisualGeometry(carrier, at, Box(*valve.marker.size, STICKER), "marker", np.array(RED))
     for k, obstacle in enumerate(valve.obstacles):
-        panel = plant.GetBodyByName("panel", model)
         X = _rigid(compose(X_PA, make(np.eye(3), np.array(obstacle.xyz))))
         _solid(plant, panel, X, Box(*obstacle.size), f"obstacle_{k + 1}", ENAMEL)
+    return model
+
+
+def _read(plant: MultibodyPlant, valve: Valve) -> ModelInstanceIndex:
+    """Adds the model of a file, which is to be put together as the ones that are made here. Raises ConfigError."""
+    key = "valve.model"
+    try:
+        model = parse(plant, _file(valve.model))
+    except ConfigError as error:
+        text = str(error)
+        raise ConfigError(text if text.startswith(key) else f"{key}: {text}") from error
+    stem = joint_named(plant, model, "stem", f"{key}: stem")
+    axis = frame_named(plant, model, "valve_axis", f"{key}: valve_axis")
+    wheel, panel = (frame_named(plant, model, name, f"{key}: {name}").body() for name in ("wheel", "panel"))
+
+    def must(ok: bool, rule: str) -> None:
+        require(ok, key, rule, valve.model)
+
+    level = axis.body().index() == panel.index() and axis.GetFixedPoseInBodyFrame().IsNearlyIdentity(ON_MODEL)
+    must(level, "one whose frame valve_axis is the link panel's own")
+    ends = stem.parent_body().index(), stem.child_body().index()
+    between = isinstance(stem, RevoluteJoint) and ends == (panel.index(), wheel.index())
+    must(between, "one whose joint stem is revolute, from the link panel to the link wheel")
+    X_PanelF = stem.frame_on_parent().GetFixedPoseInBodyFrame()
+    X_PanelWheel = X_PanelF @ stem.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+    must(X_PanelWheel.IsNearlyIdentity(ON_MODEL), "one whose links panel and wheel share a frame with the stem at zero")
+    off_axis = np.abs([*X_PanelF.translation()[:2], *(X_PanelF.rotation() @ stem.revolute_axis() + [0, 0, 1])]).max()
+    must(bool(off_axis < ON_MODEL), "one whose joint stem turns about -z of the link panel, through its origin")
+    actuators = (plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices())
+    driven = any(actuator.joint().index() == stem.index() and actuator.name() == "stem" for actuator in actuators)
+    must(driven, "one whose joint stem has an actuator of its name (an effort limit)")
+    must(parent_joint(plant, model, panel) is None, "one whose link panel hangs on nothing: the scene puts it anywhere")
     return model
 
 

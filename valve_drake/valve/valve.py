@@ -25,6 +25,7 @@ OPENING = {"counter_clockwise": 1.0, "clockwise": -1.0}  # sense that opens -> i
 FARTHEST = 0.235  # of such a marker from the axis [m]
 LOOK = 0.12  # from such a marker's middle towards the axis, where the head looks [m]
 ALIKE = 0.02  # handles that differ by less look the same to the head's cameras [m]
+SAME_RIM = 0.005  # by which places on one rim may differ; a hand's fingers make up for as much [m]
 LOWEST_MARK = 0.003  # of a green mark over the middle of a handle that is made of the keys [m]
 _UPRIGHT = 0.35  # horizontal part of an axis' direction below which it has no heading of its own
 
@@ -101,6 +102,12 @@ class ObstacleConfig(Config):
     size: list[float] = numbers([0.1, 0.1, 0.1], 0.001, 10.0, "along x, y and z of A [m]")
 
 
+def _alike(key: str, words: str, values: list[float]) -> None:
+    """Of the handles on a rim, which is one ring [m]. Raises ConfigError."""
+    same = not values or max(values) - min(values) < SAME_RIM
+    require(same, key, f"{words} all others on the rim", [round(value, 4) for value in values])
+
+
 def _ends_of_the_bar() -> list[HandleConfig]:
     return [HandleConfig(xyz=[x, 0.0, 0.0]) for x in (0.15, -0.15)]
 
@@ -136,9 +143,11 @@ class Valve(Config):
         for k, handle in enumerate(handles):
             before = handle.xyz[2] < self.panel.depth
             require(before, f"{key}.handles[{k}].xyz", f"before the panel, z below {self.panel.depth:g}", handle.xyz)
-        rims = [math.hypot(*handle.xyz[:2]) for handle in handles if handle.kind == "rim"]
-        round_ = not rims or max(rims) - min(rims) < 0.005
-        require(round_, f"{key}.handles", "as far from the axis as all others on the rim", [round(r, 4) for r in rims])
+        rims = [handle for handle in handles if handle.kind == "rim"]
+        _alike(f"{key}.handles", "as far from the axis as", [math.hypot(*handle.xyz[:2]) for handle in rims])
+        if not self.model:
+            _alike(f"{key}.handles", "as high over the panel (z) as", [handle.xyz[2] for handle in rims])
+            _alike(f"{key}.handles", "as wide as", [handle.width for handle in rims])
         before = self.marker.xyz[2] < self.panel.depth
         require(before, f"{key}.marker.xyz", f"before the panel, z below {self.panel.depth:g}", self.marker.xyz)
         if not self.model:
