@@ -293,6 +293,21 @@ def test_what_follows_the_commands_is_not_of_a_ticks_time_but_can_make_the_next_
     assert clock[0] == pytest.approx(0.027)
 
 
+def test_what_a_pacer_tells_of_days_is_right_and_made_within_a_tick(monkeypatch):
+    """A run that waits for its operators has no end, and the report of all its ticks is made in one of them."""
+    clock = [0.0]
+    monkeypatch.setattr("valve_drake.pace.wall.monotonic", lambda: clock[0])
+    pacer = Pacer(0.01, idle=lambda left: clock.__setitem__(0, clock[0] + left))
+    times = np.random.default_rng(0).lognormal(np.log(0.002), 0.5, 20_000)
+    for seconds in times.tolist():
+        pacer.tick(lambda seconds=seconds: clock.__setitem__(0, clock[0] + seconds))
+    pace = pacer.report(0.0)
+    assert pace.median == pytest.approx(float(np.median(times)), rel=5e-3)
+    assert pace.p99 == pytest.approx(float(np.quantile(times, 0.99)), rel=1e-2)
+    assert pace.ticks == 20_000 and pace.longest == pytest.approx(times.max())
+    assert sum(len(value) for value in vars(pacer).values() if hasattr(value, "__len__")) < 10_000  # however many ticks
+
+
 # ---------------------------------------------------------------- the whole, in one process
 
 
