@@ -81,9 +81,15 @@ def change(path, edit) -> None:
         (lambda d: d["left"].update(jacobian=[[1, 2, 3]] * 3), r"left\b.*[jJ]acobian must be well conditioned"),
         (lambda d: d["right"].update(jacobian=[[0, 0, 0]] * 3), r"right\b.*[jJ]acobian must be well conditioned"),
         (lambda d: d["left"].update(area=0.0), r"left\.area"),
+        (lambda d: d["left"].update(area=True), r"left\.area"),
+        (lambda d: d["left"].update(area="8900"), r"left\.area"),
+        (lambda d: d["right"].update(feature=["3.3", "2.8", "0.01"]), r"right\.feature must be \(3,\) finite numbers"),
+        (lambda d: d["left"].update(feature=[0, 0, 0]), r"left\.feature\[2\] must be > 0, got 0"),
+        (lambda d: d["left"].update(feature=[3.3, 2.8, -0.01]), r"left\.feature\[2\] must be > 0, got -0.01"),
         (lambda d: d.update(made_for="me"), r"made_for must be a mapping of robot, marker"),
         (lambda d: d.update(made_for={"robot": "a", "marker": "b"}), r"made_for must be a mapping of robot, marker"),
         (lambda d: d.update(made_for={"robot": "a", "marker": 3, "opening": 0.08}), r"made_for must be a mapping"),
+        (lambda d: d.update(made_for={"robot": "a", "marker": "b", "opening": True}), r"made_for must be a mapping"),
     ],
 )
 def test_a_bad_file_is_refused_by_name_and_key(file, edit, words):

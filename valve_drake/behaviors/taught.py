@@ -1,7 +1,6 @@
 """What the hands were taught: the reference image of each green mark, as its feature, and the image Jacobian there."""
 
 import dataclasses as dc
-import math
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from valve_drake import outputs, yaml_file
-from valve_drake.checks import ConfigError, require
+from valve_drake.checks import ConfigError, is_number, require
 from valve_drake.messages import SIDES
 
 _SHAPES = {"feature": (3,), "jacobian": (3, 3), "area": (), "corners": (4, 2)}
@@ -71,8 +70,7 @@ def load_made_for(path: str | pathlib.Path) -> MadeFor | None:
     except TypeError:
         raise ConfigError(f"{source}: made_for must be {rule}") from None
     good = all(isinstance(text, str) and len(text) <= 64 for text in (made.robot, made.marker))
-    number = isinstance(made.opening, int | float) and math.isfinite(made.opening)
-    if not (good and number):
+    if not (good and is_number(made.opening)):
         raise ConfigError(f"{source}: made_for must be {rule}")
     return made
 
@@ -84,6 +82,13 @@ def _read(path: str | pathlib.Path, source: str) -> dict[str, Any]:
     return data
 
 
+def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
+    """Whether it is lists of finite numbers of this shape; no other text, truth value or file's content is."""
+    if not shape:
+        return is_number(value)
+    return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(item, shape[1:]) for item in value)
+
+
 def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
     """Both hands' references. Raises ConfigError that names the file and the key, and never shows a foreign file."""
     data = _read(path, f"taught references {path}")
@@ -92,15 +97,12 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
         values: dict[str, Any] = {}
         for name, shape in _SHAPES.items():
             key = f"taught references {path}: {side}.{name}"
-            try:
-                value = np.array(data[side][name], float)
-            except (KeyError, TypeError, ValueError, OverflowError) as error:
-                raise ConfigError(f"{key} must be {shape} numbers") from error
-            require(
-                value.shape == shape and bool(np.isfinite(value).all()), key, f"{shape} finite numbers", value.tolist()
-            )
-            values[name] = float(value) if shape == () else value
-        require(float(values["area"]) > 0, f"taught references {path}: {side}.area", "> 0", values["area"])
+            given = data[side].get(name) if isinstance(data[side], dict) else None
+            if not _has_shape(given, shape):
+                raise ConfigError(f"{key} must be {shape} finite numbers")
+            values[name] = float(given) if shape == () else np.array(given, float)
+        for key, value in (("area", values["area"]), ("feature[2]", float(values["feature"][2]))):
+            require(value > 0, f"taught references {path}: {side}.{key}", "> 0", value)
         try:
             out[side] = TaughtReference(**values)
         except ConfigError as error:
