@@ -343,6 +343,13 @@ def test_what_is_no_log_is_one_line_and_2(make, words, tmp_path, capsys):
     assert code == 2 and out == "" and err.count("\n") == 1 and words in err
 
 
+@pytest.mark.parametrize("name", ["", ".", "..", "/"])
+@pytest.mark.parametrize("export", [[], ["--export", "csv", "--topic", "/health"]])
+def test_what_is_no_name_of_a_file_is_no_log_either(name, export, capsys):
+    code, out, err = review(capsys, name, *export)
+    assert code == 2 and out == "" and err.count("\n") == 1 and "cannot be read: Is a directory" in err
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

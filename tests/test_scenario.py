@@ -50,6 +50,7 @@ def test_close_starts_open_and_an_explicit_position_stays():
         ("simulation.valve.height=abc", ["simulation.valve.height", "number", "abc"]),
         ("simulation.valve.height=9", ["simulation.valve.height", "within", "9"]),
         ("simulation.valve.height=.nan", ["simulation.valve.height", "finite", "nan"]),
+        ("angle=!Uniform {min: 1, max: 2}", ["angle must be a finite number, got !Uniform {min: 1, max: 2}"]),
         ("simulation.valve.height=!Gaussian {mean: 1}", ["!Gaussian", "!Uniform"]),
         ("simulation.valve.height=!Uniform {min: 1.2, max: 0.9}", ["simulation.valve.height", "min <= max"]),
         ("simulation.valve.height=!Uniform {max: 1.2}", ["simulation.valve.height", "{min: a, max: b}", "1.2"]),
@@ -79,6 +80,8 @@ def test_bad_values_give_one_line_that_names_key_rule_and_value(override, words)
 
 
 def test_a_missing_file_and_one_that_is_not_yaml(tmp_path):
+    with pytest.raises(ConfigError, match="no such file: ''"):
+        mut.load("")  # a variable of the shell that is empty is no wish for the default scenario
     with pytest.raises(ConfigError, match="no such file: nowhere.yaml"):
         mut.load("nowhere.yaml")
     bad = tmp_path / "bad.yaml"

@@ -31,4 +31,4 @@ def find(path: str, base: Path) -> Path:
                 return candidate
         except (OSError, ValueError):  # a name that is too long, or that no file can have
             pass
-    raise ConfigError(f"no such file: {path if len(path) <= MAX_SHOWN else shown(path)}")
+    raise ConfigError(f"no such file: {path if 0 < len(path) <= MAX_SHOWN else shown(path)}")

@@ -128,7 +128,7 @@ def load(path: str | None = None, overrides: typing.Sequence[str] = ()) -> Scena
     A name needs neither its folder `levels` nor its ending. A file that begins `like: FILE` states only what differs
     from that one. Raises ConfigError: no such file, not YAML, unknown key, wrong type, value out of range.
     """
-    return with_overrides(_load(path or DEFAULT, 0), overrides)
+    return with_overrides(_load(DEFAULT if path is None else path, 0), overrides)
 
 
 def _load(name: str, depth: int) -> Scenario:

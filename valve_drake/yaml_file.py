@@ -32,6 +32,12 @@ class Tagged:
     tag: str
     tree: Tree
 
+    def __repr__(self) -> str:
+        """As a file has it, for error lines."""
+        if not isinstance(self.tree, dict):
+            return f"{self.tag} {shown(self.tree)}"
+        return f"{self.tag} {{{', '.join(f'{key}: {shown(value)}' for key, value in self.tree.items())}}}"
+
 
 _NULL = {"", "~", "null", "Null", "NULL"}
 _BOOL = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}

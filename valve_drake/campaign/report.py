@@ -86,7 +86,7 @@ def page(records: list[Record], beside: Path, logs: Path | None = None) -> str:
         link = None
         if log is not None:
             path = (logs or beside) / log
-            review = path.with_name(f"{path.stem}.review.html")
+            review = path.parent / f"{path.stem}.review.html"
             link = _relative(review if review.exists() else path, beside)
         values = {title: figure(record) for title, figure in FIGURES.items()}
         again = shlex.join(record["command"]) if record.get("command") else ""

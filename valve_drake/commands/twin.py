@@ -23,7 +23,8 @@ def command(options: argparse.Namespace) -> int:
     from valve_drake import scenario as scenarios
     from valve_drake.rehearsal import run_twin
 
-    scenario = scenarios.load(options.scenario or "hardware.scenario.yaml", scenario_overrides(options))
+    name = "hardware.scenario.yaml" if options.scenario is None else options.scenario
+    scenario = scenarios.load(name, scenario_overrides(options))
     with stopper() as stop:
         result = run_twin(scenario, duration=options.duration, stop=stop)
     if options.json:
