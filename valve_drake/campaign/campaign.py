@@ -14,7 +14,6 @@ import contextlib
 import dataclasses as dc
 import fcntl
 import itertools
-import math
 import os
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,14 +21,16 @@ from typing import Any
 
 import numpy as np
 
-from valve_drake import config, outputs, scenario
+from valve_drake import config, named_files, outputs, scenario
 from valve_drake.analysis.metrics import Summary, figures
+from valve_drake.camera.lens import load_head
 from valve_drake.campaign import hunting
 from valve_drake.campaign.failures import Failure
 from valve_drake.campaign.statistics import interval
-from valve_drake.campaign.trial import Record, Trial, files_of, perform, turned
+from valve_drake.campaign.trial import AT_ANGLE, Record, Trial, files_of, perform, turned
 from valve_drake.checks import ConfigError, OperationFailed, is_number, require, shown
 from valve_drake.config import Uniform
+from valve_drake.diagram import robot_of
 from valve_drake.messages import Verdict
 from valve_drake.versions import versions
 
@@ -78,7 +79,9 @@ class Campaign:
         return {name: (path, self.overrides) for name, path in zip(names, self.scenarios)}
 
     def check(self) -> None:
-        """Raises ConfigError: numbers out of range, a wrong scenario, two with one name, nothing to hunt in."""
+        """Raises ConfigError: numbers out of range, a scenario or robot that no run can use, two with one name,
+        nothing to hunt in.
+        """
         require(1 <= self.runs <= MOST, "--runs", f"within 1 and {MOST}", self.runs)
         last = self.first_seed + self.runs - 1
         require(
@@ -89,6 +92,9 @@ class Campaign:
             given = scenario.load(path, overrides)
             wire = given.operator_channel.wire
             require(wire == "none", "operator_channel.wire", "none in a campaign: its runs wait for nobody", wire)
+            require(given.station != "replay", "station", "one that runs (a log is replayed by `replay LOG`)", "replay")
+            robot_of(given)
+            load_head(named_files.find(given, "head_calibration"))
             if self.hunt and not _ranges(given):
                 raise ConfigError(f"{path}: there is nothing to hunt in: no key has a distribution")
 
@@ -395,12 +401,12 @@ def least_honesty(record: Record) -> float | None:
     return min(shares.values()) if shares else None
 
 
-def false_verdicts(records: Sequence[Record], tolerance: float = math.radians(3.0)) -> dict[str, Any]:
+def false_verdicts(records: Sequence[Record], tolerance: float = AT_ANGLE) -> dict[str, Any]:
     """The verdict against the truth: `turned` though the valve is not where it should be, and the other way round, with
     the interval of the rate of each. `unverified` claims neither: such runs are counted apart, with how many of their
     valves are where they should be.
 
-    tolerance: of the angle, the camera's tolerance and its error together.
+    tolerance: of the angle [rad].
     """
     known, false = 0, {"turned": 0, "failure": 0}
     unverified: list[bool] = []

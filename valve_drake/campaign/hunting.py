@@ -11,7 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import qmc
 
-from valve_drake.campaign.trial import Record, turned
+from valve_drake.behaviors.hybrid_rotation_config import HybridRotationConfig
+from valve_drake.campaign.trial import AT_ANGLE, Record, turned
 
 BATCH = 8  # runs that are chosen at a time, however many run at a time; raise it for many workers
 EXPLORE = 1 / 3  # of a batch, anywhere; raise it if a hunt keeps to one kind of failure
@@ -21,10 +22,10 @@ NARROWEST = 0.02  # of the draws about a run, as a share of a distribution's ran
 
 # Where a figure of a run is as good as a failure; the margin is what is left of the worst one.
 _EDGES = {
-    "angle": math.radians(3.0),  # true minus asked [rad]
+    "angle": AT_ANGLE,  # true minus asked [rad]
     "honesty": 0.05,  # of the valve's way not held by both pads of a hand
-    "turn_peak_hand_force_N": 55.0,  # ends the turn
-    "peak_internal_force_N": 55.0,
+    "turn_peak_hand_force_N": HybridRotationConfig.force_trip,  # ends the turn
+    "peak_internal_force_N": HybridRotationConfig.force_trip,
     "retries": 4.0,
 }
 

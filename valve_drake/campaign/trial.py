@@ -6,6 +6,7 @@ scenario and seed are equal but for that.
 
 import contextlib
 import dataclasses as dc
+import math
 import os
 import signal
 import subprocess
@@ -22,6 +23,7 @@ from valve_drake.recording.container import active
 Record: TypeAlias = dict[str, Any]
 
 PROGRAM = (sys.executable, "-m", "valve_drake")
+AT_ANGLE = math.radians(3.0)  # nearer than that a valve is where it was asked to be: the camera's tolerance and error
 # Outcomes beside those of a run: its process died, did not end, or it ended at its time limit.
 CRASHED, TIMED_OUT, UNFINISHED = "crashed", "timed_out", "unfinished"
 # What a run's process does before it becomes the program: if this one is killed, so is the run, and a resumed campaign
