@@ -97,7 +97,7 @@ def load_taught(path: str | pathlib.Path) -> dict[str, TaughtReference]:
         values: dict[str, Any] = {}
         for name, shape in _SHAPES.items():
             key = f"taught references {path}: {side}.{name}"
-            given = data[side].get(name) if isinstance(data[side], dict) else None
+            given: Any = data[side].get(name) if isinstance(data[side], dict) else None
             if not _has_shape(given, shape):
                 raise ConfigError(f"{key} must be {shape} finite numbers")
             values[name] = float(given) if shape == () else np.array(given, float)
