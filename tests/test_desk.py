@@ -2,8 +2,10 @@
 
 import io
 import json
+import os
 import threading
 import time
+import types
 import wave
 
 import numpy as np
@@ -12,6 +14,7 @@ from pydrake.lcm import DrakeLcm
 
 from valve_drake import cli
 from valve_drake.checks import ConfigError, OperationFailed
+from valve_drake.commands import operator
 from valve_drake.console import console
 from valve_drake.messages import ModeState, OperatorCommand, OperatorPackets, OperatorState, Status
 from valve_drake.operator.desk import KEYS, Desk
@@ -84,6 +87,36 @@ def test_every_key_says_a_sentence_of_the_grammar():
         assert Office().press(key).words == [words]
     assert Office().press("\r").words == ["confirm"]
     assert Office().press("zZ#\x1b").words == []
+
+
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        ("\x1b[A ", " "),  # an arrow, and the stop that a slow page has read with it
+        (" \x1b[C", " "),  # no `close` of the C
+        ("o\x1b[1;5C\x1bOPc", "oc"),
+        ("\x1b", "\x1b"),
+        ("\x1b ", "\x1b "),
+        ("\x1b[200~stop\x1b[201~", "stop"),  # pasted
+        ("°", "°"),
+    ],
+)
+def test_keys_without_a_character_are_left_out_and_no_other(monkeypatch, text, keys):
+    """However the terminal's bytes are cut into pieces; but for an escape, which alone is a key."""
+    ours, terminal = os.openpty()
+    monkeypatch.setattr("sys.stdin", types.SimpleNamespace(fileno=lambda: terminal))
+    data = text.encode()
+    for cut in (0, *range(2, len(data))):
+        if data[:cut].endswith(b"\x1b"):
+            continue
+        with operator._keys() as pressed:
+            found = ""
+            for piece in (data[:cut], data[cut:]):
+                os.write(ours, piece)
+                found += pressed(0.1) if piece else ""
+        assert found == keys, cut
+    os.close(ours)
+    os.close(terminal)
 
 
 def test_a_sentence_is_typed_said_by_enter_and_forgotten_by_escape():
@@ -180,8 +213,8 @@ def test_a_slow_ear_keeps_the_link_alive_and_its_words_come_in_order_at_last():
     assert "late" not in office.page(width=120)
     said = [line.text for line in office.desk.lines if line.who == "you"]
     assert said == [f"word {k} (0.90)" for k in range(6)]
-    beside.push(np.full(1, 13, np.int16))
     with pytest.raises(OperationFailed, match="the thirteenth"):
+        beside.push(np.full(1, 13, np.int16))  # may be heard at once
         for _ in range(3000):
             beside.push(np.zeros(0, np.int16))
             time.sleep(0.01)

@@ -1,6 +1,7 @@
 """`valve-drake operator`: the desk from which an operator commands a robot by keys, words or voice."""
 
 import argparse
+import codecs
 import contextlib
 import os
 import select
@@ -140,18 +141,22 @@ def _keys() -> Iterator[Callable[[float], str]]:
     import termios
     import tty
 
+    from valve_drake.operator.desk import keys_of
+
+    decoder, rest = codecs.getincrementaldecoder("utf-8")("replace"), ""
     descriptor = sys.stdin.fileno()
     before = termios.tcgetattr(descriptor)
     tty.setcbreak(descriptor)
 
     def keys(seconds: float) -> str:
+        nonlocal rest
         if not select.select([descriptor], [], [], seconds)[0]:
             return ""
         data = os.read(descriptor, 256)
         if not data:  # the terminal is gone
             raise OperationFailed("the terminal was closed")
-        text = data.decode("utf-8", "replace")
-        return "" if text.startswith("\x1b") and len(text) > 1 else text  # arrows and the like
+        pressed, rest = keys_of(rest + decoder.decode(data))
+        return pressed
 
     try:
         yield keys

@@ -1,6 +1,7 @@
 """The operator's desk: what it shows, and what its keys say. It knows no terminal; commands/operator.py has one."""
 
 import dataclasses as dc
+import re
 import time as wall
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -34,6 +35,21 @@ LATE = 1.0  # of sound that waits to be heard, from which the page says so [s]
 NOTHING = np.zeros(0, np.int16)
 MOST_LINES = 500  # of the conversation that are kept
 COLORS = {"you": "cyan", "robot": "bold", "desk": "yellow"}
+
+
+# What a terminal sends for a key without a character (arrows, function keys), and the beginning of such.
+_SEQUENCE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|O[ -~])")
+_BEGINNING = re.compile(r"\x1b(?:\[[0-?]*[ -/]*|O)\Z")
+
+
+def keys_of(text: str) -> tuple[str, str]:
+    """The keys that a terminal's text stands for, and what of it belongs to the text that comes next.
+
+    Keys without a character are left out, and nothing else: a stop that comes with an arrow is a stop.
+    """
+    text = _SEQUENCE.sub("", text)
+    rest = _BEGINNING.search(text)
+    return (text, "") if rest is None else (text[: rest.start()], rest[0])
 
 
 @dc.dataclass(frozen=True)
