@@ -154,6 +154,27 @@ def test_a_simulated_robots_hands_are_taught_when_they_have_to_be_and_once(case,
     assert len(lessons) == 1 and again.taught == ready.taught and said[-1].endswith(f"{ready.taught} stands in")
 
 
+@pytest.mark.parametrize("damage", ["", "left: [1", "left: {}\nright: {}\n"])
+def test_kept_references_that_are_damaged_are_taught_anew(damage, lessons, tmp_path):
+    scenario = scenarios.resolve(scenarios.load(None, [f"robot={changed(tmp_path / 'robot', opening=0.08)}"]))
+    kept = Path(teaching.prepared(scenario).taught)
+    kept.write_text(damage)
+    assert teaching.prepared(scenario).taught == str(kept) and load_taught(kept) and len(lessons) == 2
+
+
+def test_a_cache_that_cannot_be_is_told_before_the_lesson(lessons, tmp_path, monkeypatch):
+    scenario = scenarios.resolve(scenarios.load(None, [f"robot={changed(tmp_path / 'robot', opening=0.08)}"]))
+    (tmp_path / "file").write_text("mine")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(OperationFailed, match="cannot be made: Not a directory"):
+        teaching.prepared(scenario)
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: Path("~nobody_of_this_name").expanduser())
+    with pytest.raises(ConfigError, match="HOME or XDG_CACHE_HOME must be given"):
+        teaching.prepared(scenario)
+    assert not lessons
+
+
 @pytest.mark.parametrize("case", CHANGES)
 def test_a_real_robot_with_references_of_another_is_refused_with_what_to_do(case, lessons, tmp_path):
     make, overrides, words = CHANGES[case]

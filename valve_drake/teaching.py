@@ -23,7 +23,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram
 
 from valve_drake import named_files, outputs
-from valve_drake.behaviors.taught import MadeFor, TaughtReference, load_made_for, save_taught
+from valve_drake.behaviors.taught import MadeFor, TaughtReference, load_made_for, load_taught, save_taught
 from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.diagram import initial_commands, make_station, robot_of
 from valve_drake.frames import make
@@ -97,15 +97,30 @@ def prepared(scenario: Scenario, say: Callable[[str], None] = lambda line: None)
     if scenario.station != "simulated":
         raise ConfigError(f"{why}: put the hands on the handles and run `valve-drake teach SCENARIO`")
     path = _cached(wanted)
-    if not (path.is_file() and not wanted.unlike(load_made_for(path))):
+    if not _serve(path, wanted):
+        outputs.make_folder(path.parent)  # before the work: a cache that cannot be written keeps nothing
         say(f"{why}: the hands are taught, once")
         write(dc.replace(scenario, seed=0), path.parent)
     say(f"{why}: {path} stands in")
     return dc.replace(scenario, taught=str(path))
 
 
+def _serve(path: Path, wanted: MadeFor) -> bool:
+    """Whether references of the cache are good; damaged ones are made anew."""
+    try:
+        return bool(load_taught(path)) and not wanted.unlike(load_made_for(path))
+    except ConfigError:
+        return False
+
+
 def _cached(wanted: MadeFor) -> Path:
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    """Where the references of such a robot are kept. Raises ConfigError: the user has no folder for a cache."""
+    try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # neither HOME nor an entry in the list of users
+        raise ConfigError(
+            "HOME or XDG_CACHE_HOME must be given: the hands are taught, and their references kept"
+        ) from None
     return home / CACHE / "taught" / _hash(repr(wanted)) / REFERENCES
 
 
