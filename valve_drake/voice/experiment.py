@@ -101,8 +101,8 @@ class Ear:
         """(n,) int16 -> when it was decided [s], and what was heard."""
         memory, sound, out = Memory(), Hindsight(self.judge), []
         for k, p in enumerate(self.net.probabilities(self.batch.rows(samples))):
-            loud = sound.push(samples[k * BLOCK : (k + 1) * BLOCK])
-            memory, heard = step(memory, p, loud, sound.second)
+            level = sound.push(samples[k * BLOCK : (k + 1) * BLOCK])
+            memory, heard = step(memory, p, level, sound.second)
             out += [((k + 1) * STEP, each) for each in heard]
         return out
 

@@ -1,6 +1,7 @@
-"""The last seconds of a stream of sound: whether somebody speaks now, and what a judge makes of them."""
+"""The last seconds of a stream of sound: how loudly somebody speaks now, and what a judge makes of them."""
 
 import collections
+import math
 from typing import Optional
 
 import numpy as np
@@ -29,13 +30,14 @@ class Hindsight:
     def second(self) -> Optional["Hindsight"]:
         return self if self._judge is not None else None
 
-    def push(self, block: np.ndarray) -> bool:
-        """The next (BLOCK,) int16 -> whether somebody speaks in it."""
+    def push(self, block: np.ndarray) -> float | None:
+        """The next (BLOCK,) int16 -> the level of the speech in it [dB of full scale]; None: nobody speaks."""
         self._sound = np.concatenate([self._sound[BLOCK:], block])
         self._heard = min(self._heard + BLOCK, len(self._sound))
         power = float(np.mean(np.square(block / 32768)))
-        self._levels.append(max(10 * np.log10(max(power, 1e-12)), QUIETEST))
-        return self._levels[-1] > max(min(self._levels) + ABOVE, max(self._levels) - BELOW)
+        level = max(10 * math.log10(max(power, 1e-12)), QUIETEST)
+        self._levels.append(level)
+        return level if level > max(min(self._levels) + ABOVE, max(self._levels) - BELOW) else None
 
     def look(self, back: float, seconds: float) -> Look:
         """At the last `back` seconds, filled up to `seconds`."""

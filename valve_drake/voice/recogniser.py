@@ -11,8 +11,8 @@ robot is refused by that. `stop` does not wait for the end of a sentence, nor fo
 end.
 
 Where the packages of judge.py are installed, a second ear is asked: at a sentence's end, which words it heard, and how
-likely the likeliest sentences are in their sound; at a word that may be `stop`, and after any short burst of speech,
-whether it was `stop`. Without them the network decides.
+likely the likeliest sentences are in their sound; at a word that may be `stop`, and wherever a short burst of speech
+grows quieter, whether it was `stop`. Without them the network decides.
 """
 
 import dataclasses as dc
@@ -58,12 +58,13 @@ LEAD = 0.8  # of sound before the first word that was noticed: a word is noticed
 FILLED = 6.0  # to which silence fills a sentence up, what the second ear is used to; raise it for longer ones [s]
 # `stop`: the network alone is believed from STOP_SURE; beside a second ear it is asked between these two.
 STOP_MAYBE = 0.04  # lower: fewer are missed, the second ear is asked more often (30 ms each)
-STOP_CERTAIN = 0.97  # lower: fewer are missed, more are heard in other words
+STOP_CERTAIN = 0.99  # lower: fewer are missed, more are heard in other words
 STOP_HEARD = 0.5  # share of the ln of the odds that the second ear heard the word, beside that it would write it
-STOP_LIKELY = -3.3  # their sum from which it is one; lower: fewer are missed, more are heard in other words
-# It is asked too one step after a short burst of speech, whatever the network says: the word is noticed sooner so.
-BURST = 2, 12  # steps of such a burst; wider: fewer `stop` within longer speech are missed, more asking
-BURST_LIKELY = -2.5  # instead of STOP_LIKELY there; lower: as above
+STOP_LIKELY = -2.25  # their sum from which it is one; lower: fewer are missed, more are heard in other words
+# It is asked too, whatever the network says, wherever a short burst of speech grows quieter: most words are loudest
+# before their end, and what follows, a breath, an echo or noise, soon hides from the second ear what they were.
+BURST = 12  # steps of such a burst, at most; higher: fewer `stop` within longer speech are missed, more asking
+FALLEN = 6.0  # below its loudest step [dB]; lower: asked more often, and a word is noticed sooner
 STOP_BACK, STOP_FILLED = 1.0, 3.0  # of sound that it is asked about, and to which silence fills it up [s]
 _EARLY = 0.1  # probability of `confirm` from which it is asked whether the sentence is no more than that
 
@@ -237,17 +238,16 @@ def _sentence(words: np.ndarray, heard: str, second: SecondEar | None, back: flo
     return text if probability >= needed else heard, score(probability, needed)
 
 
-def _stop(probability: float, ended: bool, second: SecondEar | None) -> float:
-    """How sure it is that `stop` has just been said, as a score. probability: the network's. ended: a burst has."""
+def _stop(probability: float, falls: bool, second: SecondEar | None) -> float:
+    """How sure it is that `stop` has just been said, as a score. probability: the network's. falls: a burst does."""
     if second is None or probability >= STOP_CERTAIN:
         return score(probability, STOP_SURE)
-    if probability < STOP_MAYBE and not ended:
+    if probability < STOP_MAYBE and not falls:
         return 0.0
-    needed = STOP_LIKELY if probability >= STOP_MAYBE else BURST_LIKELY
     look = second.look(STOP_BACK, STOP_FILLED)
     found = float(look.likelihoods([*judges.written("stop"), *judges.written(f"{grammar.WAKE} stop")]).max())
     heard = float(np.clip(look.words[:, INDEX["stop"]].max(), 0.5, 1 - 1e-6))  # it may speak for it, never against it
-    return 1 / (1 + math.exp(needed - found - STOP_HEARD * math.log(heard / (1 - heard))))
+    return 1 / (1 + math.exp(STOP_LIKELY - found - STOP_HEARD * math.log(heard / (1 - heard))))
 
 
 def _without(p: np.ndarray, words: list[str]) -> np.ndarray:
@@ -265,15 +265,15 @@ def _without(p: np.ndarray, words: list[str]) -> np.ndarray:
 class Memory:
     """time: steps so far. said: the probabilities since the sentence began, oldest first; empty: nobody speaks.
 
-    loud: steps in which somebody has spoken without a pause. ended: a burst of BURST steps has, one step ago. quiet:
-    steps since somebody spoke. wordless: since the last word, within the sentence. since: the step before which
-    all sound belongs to what was heard already. before: the probabilities of the last step. deaf: steps for which
-    `stop` and `confirm` are not heard again.
+    burst: levels of the steps in which somebody has spoken without a pause [dB]. ended: a burst of BURST steps at most
+    has, one step ago. quiet: steps since somebody spoke. wordless: since the last word, within the sentence. since: the
+    step before which all sound belongs to what was heard already. before: the probabilities of the last step. deaf:
+    steps for which `stop` and `confirm` are not heard again.
     """
 
     time: int = 0
     said: tuple[np.ndarray, ...] = ()
-    loud: int = 0
+    burst: tuple[float, ...] = ()
     ended: bool = False
     quiet: int = 0
     wordless: int = 0
@@ -283,22 +283,24 @@ class Memory:
 
 
 def step(
-    m: Memory, p: np.ndarray, loud: bool = False, second: SecondEar | None = None
+    m: Memory, p: np.ndarray, level: float | None = None, second: SecondEar | None = None
 ) -> tuple[Memory, tuple[Heard, ...]]:
     """The probabilities of the next 80 ms (CLASSES,) -> what was heard in them. begin and end: [s] of the stream.
 
-    loud: somebody speaks in them, ours or not. second: the second ear, if there is one.
+    level: of the speech in them, ours or not [dB]; None: nobody speaks. second: the second ear, if there is one.
     """
     deaf_stop, deaf_confirm = (max(d - 1, 0) for d in m.deaf)
     p = _without(p, [word for word, deaf in (("stop", deaf_stop), ("confirm", deaf_confirm)) if deaf])
     before = p if m.before is None else m.before
     idle = p[BLANK] + sum(p[INDEX[word]] for word in FILLERS) > 0.5
-    active = loud or not idle
+    active = level is not None or not idle
     said = (*m.said, p) if m.said or active else ()
     quiet = 0 if active else m.quiet + 1
     wordless = m.wordless + 1 if idle and m.said else 0
     time, since = m.time + 1, m.since
-    speaks, ended = m.loud + 1 if loud else 0, not loud and BURST[0] <= m.loud <= BURST[1]
+    burst = () if level is None else (*m.burst, level)[-BURST - 1 :]
+    ended = level is None and 0 < len(m.burst) <= BURST
+    falls = 0 < len(burst) <= BURST and burst[-1] <= max(burst) - FALLEN
     end = (time - quiet) * STEP
     begin = (time - max(len(said), 1)) * STEP
 
@@ -306,7 +308,7 @@ def step(
         return float(1 - (1 - p[INDEX[word]]) * (1 - before[INDEX[word]]))
 
     out: list[Heard] = []
-    stop = _stop(spike("stop"), m.ended and not deaf_stop, second)
+    stop = _stop(spike("stop"), (falls or ended or m.ended) and not deaf_stop, second)
     if stop >= SURE:
         out.append(Heard("stop", stop, begin, time * STEP))
         said, quiet, since, deaf_stop, p = (), 0, time, DEAF, _without(p, ["stop"])
@@ -323,7 +325,7 @@ def step(
             out.append(Heard(*_sentence(words, heard, second, back), begin, end))
             since = time - PAUSE // 2
         said, quiet = (), 0
-    return Memory(time, said, speaks, ended, quiet, wordless, since, p, (deaf_stop, deaf_confirm)), tuple(out)
+    return Memory(time, said, burst, ended, quiet, wordless, since, p, (deaf_stop, deaf_confirm)), tuple(out)
 
 
 # ---------------------------------------------------------------- the whole, on a stream
