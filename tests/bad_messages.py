@@ -6,8 +6,8 @@ import struct
 import numpy as np
 from robot_facts import SIZES
 
+from valve_drake.messages import CAMERAS
 from valve_drake.stations.camera_rig import encode_frame
-from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.lcm_channels import CHANNELS, UNCOUNTED, image_message, signal
 
 WILD = (math.nan, math.inf, -math.inf, 1e300, -1e300, 2.0**63, 0.5, 0.0, -1.0)

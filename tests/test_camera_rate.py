@@ -7,9 +7,9 @@ import threading
 import pytest
 
 from valve_drake.checks import ConfigError
+from valve_drake.messages import CAMERAS
 from valve_drake.processor import goes_first
 from valve_drake.stations.camera_rate import ROOM, CameraRate, limits
-from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.simulation_config import CameraConfig
 from valve_drake.supervisor.supervisor import SupervisorConfig
 

@@ -13,12 +13,12 @@ from robot_facts import GROUPS
 from valve_drake import diagram, drawing, resources
 from valve_drake import scenario as scenarios
 from valve_drake.checks import ConfigError, OperationFailed
-from valve_drake.messages import CameraFrame
+from valve_drake.messages import CAMERAS, CameraFrame
 from valve_drake.ports import SLOT, TICK
 from valve_drake.stations import hardware, lcm_channels
 from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_rig import encode_frame
-from valve_drake.stations.contract import CAMERAS, check_contract, vectors
+from valve_drake.stations.contract import check_contract, vectors
 from valve_drake.stations.hardware import SPEEDS, RobotLink, make_hardware_station
 from valve_drake.stations.lcm_channels import (
     CHANNELS,

@@ -20,7 +20,7 @@ from robot_facts import SIZES
 from valve_drake import diagram, rehearsal, runner
 from valve_drake import scenario as scenarios
 from valve_drake.checks import ConfigError, OperationFailed
-from valve_drake.messages import Mode, OperatorCommand
+from valve_drake.messages import CAMERAS, Mode, OperatorCommand
 from valve_drake.pace import Pacer
 from valve_drake.perception.color_segmentation_system import ColorSegmentationSystem
 from valve_drake.ports import SLOT, TICK
@@ -28,7 +28,6 @@ from valve_drake.recording.reader import LogReader
 from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rate import CameraRate, limits
 from valve_drake.stations.camera_rig import Capture
-from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.faults import FaultConfig, Faults, Wire
 from valve_drake.stations.hardware import RobotLink
 from valve_drake.stations.lcm_channels import (

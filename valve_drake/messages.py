@@ -14,7 +14,8 @@ import numpy as np
 POSE_HISTORY = 1.0  # length of the buffers of head and hand poses; older images are rejected [s]
 LEFT, RIGHT = "left", "right"
 SIDES = (LEFT, RIGHT)
-CAMERAS = ("head_left", "head_right", "left_wrist", "right_wrist")
+HEAD, WRISTS = ("head_left", "head_right"), ("left_wrist", "right_wrist")  # cameras
+CAMERAS = HEAD + WRISTS
 DEVICES = ("base", "torso", *(f"{s}_{d}" for s in SIDES for d in ("arm", "gripper", "wrist_sensor")), *CAMERAS, "robot")
 
 

@@ -13,7 +13,7 @@ from pydrake.lcm import DrakeLcm
 from valve_drake.checks import require
 from valve_drake.console import complain
 from valve_drake.diagram import initial_commands, make_station, rig_of, robot_of
-from valve_drake.messages import SIDES
+from valve_drake.messages import CAMERAS, SIDES
 from valve_drake.pace import Pace, Pacer
 from valve_drake.ports import SLOT
 from valve_drake.processor import goes_first
@@ -21,7 +21,6 @@ from valve_drake.scenario import Scenario, resolve
 from valve_drake.stations.bus import Bus
 from valve_drake.stations.camera_rate import CameraRate, limits
 from valve_drake.stations.camera_workers import CameraWorkers
-from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.faults import Faults
 from valve_drake.stations.hardware import RobotLink
 from valve_drake.stations.reports import listed

@@ -41,6 +41,7 @@ class Divergence(NamedTuple):
         return f"{self.topic} {self.field} {change}".replace("  ", " ")
 
     def as_json(self) -> dict[str, Any]:
+        """The object of `replay --json`."""
         plain = {key: _plain(value) for key, value in self._asdict().items()}
         return {"time_s": plain.pop("time")} | plain
 
@@ -93,6 +94,7 @@ class Comparison:
         return max((topic.max_difference for topic in self.topics.values()), default=0.0)
 
     def write(self, topic: str, message: schemas.Loggable, time: float) -> None:
+        """Takes a message at `time` [s]; it is compared when all of its instant are there."""
         if topic.startswith(UNCOMPARED):
             return
         if time != self._time and (when := nanoseconds(time)) != self._when:

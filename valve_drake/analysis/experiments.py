@@ -99,6 +99,7 @@ def read(images: list[np.ndarray], eyes: StereoHead, marker: Marker) -> tuple[Se
 
 
 def one_camera(edges: MarkerEdges) -> MarkerEdges:
+    """The edges as if the left camera were alone."""
     return dc.replace(edges, right=QuadEdges(reason="not used"))
 
 
@@ -215,7 +216,7 @@ def table2(seed: int = 0, trials: int = 20) -> dict[str, Any]:
                             one.setdefault((noise, cameras, config.method), []).append(frames.compose(X_WL, got.X_LV))
             for key, poses in one.items():
                 found.setdefault(key, []).append(poses)
-    limit = {key: value / 10 for key, value in rows[0].items() if key[-2:] in ("mm", "eg")}
+    limit = {key: value / 10 for key, value in rows[0].items() if key.endswith((" mm", " deg"))}
     for (noise, cameras, method), runs in sorted(found.items(), key=lambda item: item[0][1:] + item[0][:1]):
         row = {"noise": noise, "cameras": cameras, "method": method} | _spread_row(runs, T_w)
         row["a tenth"] = all(row[key] <= value for key, value in limit.items()) and row["poses"] == 6 * trials

@@ -5,19 +5,16 @@ import math
 
 import numpy as np
 
-from valve_drake.messages import SIDES
+from valve_drake.messages import CAMERAS, SIDES
 from valve_drake.ports import TICK
 from valve_drake.recording.foxglove import NANO
-from valve_drake.recording.layout import HEAD, WRIST
 from valve_drake.recording.reader import LogReader
-from valve_drake.recording.signals import SLOW, TRUTH
-
-CAMERAS = HEAD + WRIST
+from valve_drake.recording.signals import SLOW, TRUTH, topic_of
 
 # Topics that the recorder writes at every period. A test compares these tables with signals.py.
 PERIODS: dict[str, float] = {
     **{topic: TICK for topic in ("/joint_states", "/joint_commands", *(f"/{side}_wrist/wrench" for side in SIDES))},
-    **{"/" + port.replace(".", "/"): SLOW for port in TRUTH},
+    **{topic_of(port): SLOW for port in TRUTH},
     **{f"/{camera}/calibration": 1.0 for camera in CAMERAS},
 }
 # Outputs that a block writes at every step: the expected rate is the median rate of the log itself.
@@ -77,6 +74,7 @@ class Integrity:
 
     @property
     def lost(self) -> int:
+        """Messages that were written and are not in this file, by the holes in their numbering."""
         return sum(row.lost for row in self.topics)
 
     @property
@@ -88,6 +86,7 @@ class Integrity:
 
     @property
     def late(self) -> list[TopicRow]:
+        """Topics that miss messages."""
         return [row for row in self.topics if row.gaps]
 
     @property

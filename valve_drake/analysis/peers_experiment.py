@@ -64,6 +64,7 @@ def own_lens(lens: LensModel) -> Lens:
 
 
 def camera_matrix(lens: Lens) -> np.ndarray:
+    """K (3, 3) of a lens without distortion [px]."""
     return np.array([[lens.k_x, 0, lens.u_0], [0, lens.k_y, lens.v_0], [0, 0, 1]])
 
 
@@ -248,14 +249,10 @@ def covariance_of(X: np.ndarray, K: np.ndarray, noise: float) -> np.ndarray:
     rows = []
     for m in model():
         P = frames.apply(X, m)
-        by_point = np.hstack([-X[:, :3] @ _cross(m), np.eye(3)])
+        by_point = np.hstack([-X[:, :3] @ frames.skew(m), np.eye(3)])
         rows.append(K[:2, :2] @ np.array([[1, 0, -P[0] / P[2]], [0, 1, -P[1] / P[2]]]) / P[2] @ by_point)
     J = np.concatenate(rows)
     return noise**2 * np.linalg.inv(J.T @ J)
-
-
-def _cross(v: np.ndarray) -> np.ndarray:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
 # ---------------------------------------------------------------- the experiment
@@ -300,7 +297,7 @@ def peers(seed: int = 0, trials: int = 100, distances: Sequence[float] = DISTANC
                 for name, find in finders.items():
                     seen = find(image)
                     if seen is not None:
-                        found[name].append(_one(seen, X, K, true, name, F_all, F_outer) | {"place": place})
+                        found[name].append(_one(seen, X, K, true, F_all, F_outer) | {"place": place})
         for name, looks in found.items():
             rows.append({"z [m]": z, "detector": name} | _row(looks, K) | {"found": f"{len(looks)}/{trials}"})
     settings = {
@@ -328,7 +325,7 @@ def _errors(e: np.ndarray, F_all: np.ndarray, F_outer: np.ndarray) -> dict[str, 
 
 
 def _one(
-    seen: Seen, X: np.ndarray, K: np.ndarray, true: np.ndarray, name: str, F_all: np.ndarray, F_outer: np.ndarray
+    seen: Seen, X: np.ndarray, K: np.ndarray, true: np.ndarray, F_all: np.ndarray, F_outer: np.ndarray
 ) -> dict[str, Any]:
     """What counts of one image of a tag: squares of errors, corners, and the pose for the corners' covariance."""
     out: dict[str, Any] = {}

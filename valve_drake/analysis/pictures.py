@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from markupsafe import Markup, escape
 
-from valve_drake.analysis.integrity import CAMERAS
 from valve_drake.analysis.traces import ModeSpan
 from valve_drake.camera.image_file import decode
 from valve_drake.checks import ConfigError
+from valve_drake.messages import CAMERAS
 from valve_drake.recording.foxglove import NANO
 from valve_drake.recording.reader import LogReader
 
@@ -55,6 +55,7 @@ class Album:
 
     @property
     def cameras(self) -> list[str]:
+        """Those that took an image."""
         return list(self._taken)
 
     def newest(self, camera: str, time: float) -> tuple[float, float] | None:

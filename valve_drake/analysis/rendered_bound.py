@@ -18,12 +18,11 @@ from valve_drake.analysis import experiments
 from valve_drake.analysis.drawn_images import Canvas
 from valve_drake.camera.lens import StereoHead
 from valve_drake.diagram import robot_of
-from valve_drake.messages import MarkerEdges
+from valve_drake.messages import HEAD, MarkerEdges
 from valve_drake.perception.marker import Marker
 from valve_drake.perception.rectangle_estimator import RectangleEstimatorConfig, Track, estimate
 from valve_drake.scenario import Scenario
 from valve_drake.stations.camera_rig import CameraRig, Capture
-from valve_drake.stations.contract import HEAD
 from valve_drake.stations.scene import start_pose
 from valve_drake.stations.simulated import true_head
 from valve_drake.stations.simulation_config import CameraConfig, ErrorConfig, LightConfig, StartConfig, ValveConfig

@@ -134,10 +134,12 @@ class Comparison:
 
     @property
     def first(self) -> Divergence | None:
+        """Where the two part; None if all that both hold is equal."""
         return two_logs.first_divergence(self.topics)
 
     @property
     def sound(self) -> bool:
+        """Whether both logs are whole."""
         return self.a.integrity.sound and self.b.integrity.sound
 
 

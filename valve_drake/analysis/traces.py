@@ -106,10 +106,11 @@ class Joints:
     commanded: np.ndarray  # (N, J) positions; NaN where none is commanded
 
     def index(self, names: tuple[str, ...]) -> list[int]:
+        """Columns of those of the joints that the log has."""
         return [self.names.index(name) for name in names if name in self.names]
 
     def error(self, names: tuple[str, ...]) -> np.ndarray:
-        """Commanded minus measured -> (N, len(names))."""
+        """Commanded minus measured, of those of the joints that the log has -> (N, n) [rad, m]."""
         at = self.index(names)
         return self.commanded[:, at] - self.position[:, at]
 
@@ -202,6 +203,7 @@ class Traces:
 
     @_Trace
     def joints(self) -> Joints | None:
+        """Joints as measured and commanded; None without the measured ones."""
         states, commands = self._table("/joint_states"), self._table("/joint_commands")
         if states is None:
             return None
@@ -239,6 +241,7 @@ class Traces:
 
     @_Trace
     def truth(self) -> Truth | None:
+        """Where base and marker truly were, how far the valve was turned."""
         topics = ("/truth/base_pose", "/truth/marker_pose", "/truth/valve_angle")
         tables = [table for topic in topics if (table := self._table(topic)) is not None]
         rows = [dict(zip(time.tolist(), _vector(numbers))) for time, numbers in tables]
@@ -251,6 +254,7 @@ class Traces:
 
     @_Trace
     def touches(self) -> Touches | None:
+        """What touched what."""
         rows = self._messages("/truth/contacts")
         if not rows:
             return None
@@ -267,6 +271,7 @@ class Traces:
 
     @_Trace
     def estimates(self) -> Estimates | None:
+        """Stage 2, with its errors where the truth is known."""
         every = [m for _, m in self._messages("/rectangle_estimator/estimate") if m.sequence >= 0]
         if not every:
             return None

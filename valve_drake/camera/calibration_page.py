@@ -85,11 +85,13 @@ def cameras(numbers: dict[str, Any], result: Calibration, size: tuple[int, int])
 
 
 def page(title: str, parts: Sequence[str]) -> str:
+    """A whole page of parts that are HTML; the title is text."""
     head = f"<meta charset='utf-8'>{_MADE}<title>{html.escape(title)}</title><style>{_STYLE}</style>"
     return f"<!doctype html><html lang='en'><head>{head}</head><body>{''.join(parts)}</body></html>\n"
 
 
 def head(title: str, told: str, warnings: Sequence[str], figures: Sequence[tuple[str, str]]) -> str:
+    """Title, a sentence below it, warnings, and the figures to see first, each with what it is."""
     out = f"<h1>{html.escape(title)}</h1><p class='note'>{html.escape(told)}</p>"
     out += "".join(f"<div class='warn'>{html.escape(text)}</div>" for text in warnings)
     return out + "<p>" + " &emsp; ".join(f"<span class='big'>{n}</span> {what}" for n, what in figures) + "</p>"
@@ -109,6 +111,7 @@ def _triangulation(numbers: dict[str, Any]) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], marked: Sequence[bool] | None = None) -> str:
+    """Rows of text below their heads; those `marked` stand out."""
     out = "<tr>" + "".join(f"<th>{html.escape(name)}</th>" for name in head) + "</tr>"
     for k, row in enumerate(rows):
         kind = " class='out'" if marked is not None and marked[k] else ""
@@ -119,7 +122,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], marked: Sequence[b
 def corner_map(
     px: Sequence[np.ndarray], residuals: Sequence[np.ndarray] | None, size: tuple[int, int], caption: str
 ) -> str:
-    """The corners of each view in its colour, their residuals enlarged, empty cells tinted."""
+    """The corners (n, 2) of each view in its colour, their residuals (n, 2) enlarged [px], empty cells tinted."""
     (width, height), parts = size, []
     w, h = np.array(size) / _GRID
     for k, j in np.argwhere(~cells(np.vstack(px), size)):
@@ -137,6 +140,7 @@ def corner_map(
 
 
 def bars(names: Sequence[str], values: Sequence[float], marked: Sequence[bool], unit: str) -> str:
+    """A bar for each value, none below 0, with its name; those `marked` stand out."""
     top, parts = max(max(values), 1e-12), []
     for k, (name, value) in enumerate(zip(names, values)):
         y, length, color = 18 * k, 440 * value / top, "#b3261e" if marked[k] else "#4a7fb5"

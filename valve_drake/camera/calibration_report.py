@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses as dc
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from valve_drake import frames
+from valve_drake import frames, outputs
 from valve_drake.camera import calibration as cal
 from valve_drake.camera import calibration_page as pages
 from valve_drake.camera.board import Board, Pairs, find_corners, find_images, pair_images
@@ -37,19 +36,26 @@ class Report:
 
 @dc.dataclass(frozen=True)
 class Pictures:
-    paths: list[tuple[Path, ...]]
-    corners: list[tuple[np.ndarray | None, ...]]
-    size: tuple[int, int]
+    """The board in the images of one camera, or of two."""
+
+    paths: list[tuple[Path, ...]]  # of each view, one for each camera
+    corners: list[tuple[np.ndarray | None, ...]]  # the same, (n, 2) in the order of Board.points [px]; None: not found
+    size: tuple[int, int]  # width, height of every image [px]
     pairs: Pairs | None = None  # of two cameras
 
     def missed(self) -> list[str]:
+        """Names of the images in which no board was found."""
         return [p.name for paths, px in zip(self.paths, self.corners) for p, one in zip(paths, px) if one is None]
 
 
 def intrinsics(
     images: Sequence[str], board: Board, out: Path, kind: str = "opencv", distances: Sequence[float] | None = None
 ) -> Report:
-    """One camera from the images of a glob; distances [m] make the boards one rigid target. Writes `out`."""
+    """One camera from the images of a glob; distances [m] make the boards one rigid target. Writes `out`.
+
+    kind: opencv, paper or best. Raises ConfigError naming the option or file, OperationFailed if `out` cannot be
+    written.
+    """
     pictures = look(board, (images,), ("--images",), distances)
     result = calibrated(pictures, board, kind, distances)
     save_camera(result.fit.lenses[0], out, _comment(result))
@@ -64,7 +70,7 @@ def stereo(
     kind: str = "opencv",
     distances: Sequence[float] | None = None,
 ) -> Report:
-    """The stereo head from two globs, paired by the numbers in the names. Writes `out`."""
+    """The stereo head from two globs, paired by the numbers in the names. Writes `out`. As `intrinsics`."""
     pictures = look(board, (left, right), ("--left", "--right"), distances)
     result = calibrated(pictures, board, kind, distances)
     save_head(result.fit.head(), out, _comment(result))
@@ -83,7 +89,7 @@ def look(
     paths: list[tuple[Path, ...]] = list(pairs.paths) if pairs else [(path,) for path in found[0]]
     if distances is not None:
         if pairs and pairs.alone:
-            raise ConfigError(f"--distances needs a partner for every image, {_some(pairs.alone)} has none")
+            raise ConfigError(f"--distances needs a partner for every image, {some(_names(pairs.alone))} has none")
         wanted = f"{len(paths)} numbers, one for each image"
         require(len(distances) == len(paths), "--distances", wanted, len(distances))
         require(len(set(distances)) > 1, "--distances", "different from one another", list(distances))
@@ -115,13 +121,17 @@ def _corners(
     return corners, (first[1], first[0])
 
 
-def _some(paths: Sequence[Path]) -> str:
-    """The first six names, and how many more there are."""
-    names = [path.name for path in paths[:6]]
-    return ", ".join(names) + (f" and {len(paths) - 6} more" if len(paths) > 6 else "")
+def some(names: Sequence[str]) -> str:
+    """The first six of the names, and how many more there are."""
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    return [path.name for path in paths]
 
 
 def calibrated(pictures: Pictures, board: Board, kind: str, distances: Sequence[float] | None) -> cal.Calibration:
+    """The calibration from pictures. kind, distances [m]: as `intrinsics` has them. Raises ConfigError."""
     names = [tuple(path.name for path in paths) for paths in pictures.paths]
     return cal.calibrate(cal.board_views(board, names, pictures.corners, distances), pictures.size, kind, board)
 
@@ -164,9 +174,9 @@ def _report(command: str, result: cal.Calibration, pictures: Pictures, board: Bo
     }
     warnings: list[str] = []
     if pictures.pairs is not None:
-        numbers["without_partner"] = [path.name for path in pictures.pairs.alone]
+        numbers["without_partner"] = _names(pictures.pairs.alone)
         if pictures.pairs.alone:
-            warnings.append(f"left out for want of a partner: {_some(pictures.pairs.alone)}")
+            warnings.append(f"left out for want of a partner: {some(_names(pictures.pairs.alone))}")
         if pictures.pairs.by_order:
             left, right = pictures.paths[0]
             warnings.append(f"the names do not tell the pairs: taken in their order, {left.name} with {right.name}")
@@ -211,7 +221,7 @@ def _report(command: str, result: cal.Calibration, pictures: Pictures, board: Bo
     if pictures.missed():
         warnings.append(f"no board found in {', '.join(pictures.missed())}")
     numbers["warnings"] = warnings
-    return Report(finite(numbers), pages.cameras(numbers, result, pictures.size), _text(numbers))
+    return Report(outputs.finite(numbers), pages.cameras(numbers, result, pictures.size), _text(numbers))
 
 
 def _text(n: dict[str, Any]) -> list[str]:
@@ -244,12 +254,3 @@ def _comment(result: cal.Calibration) -> str:
         halves = ", ".join(f"{1e3 * d:.1f} mm at {z:g} m" for z, d in result.split_half.items())
         text += f"; split-half difference {halves}"
     return text
-
-
-def finite(value: Any) -> Any:
-    """The tree with None for every float that is not finite: JSON has no NaN."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

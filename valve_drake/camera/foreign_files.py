@@ -103,6 +103,7 @@ _KALIBR = {
 
 
 def is_kalibr(data: dict[str, Any]) -> bool:
+    """Whether a mapping looks like a camchain of Kalibr."""
     return any(re.fullmatch(r"cam\d+", name) for name in data)
 
 
@@ -213,6 +214,7 @@ def _visp(node: ElementTree.Element, key: str) -> OpenCvLens:
 
 
 def is_ini(text: str) -> bool:
+    """Whether a text looks like ROS's ini: it begins with a section and has a camera matrix."""
     first = re.search(r"^[ \t]*([^#;\s][^\n]*)", text, re.MULTILINE)
     return bool(first and re.fullmatch(r"\[[\w /.-]+\]\s*", first[1])) and "camera matrix" in text
 

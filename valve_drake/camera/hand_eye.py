@@ -133,11 +133,6 @@ class Method:
 # ---------------------------------------------------------------- from images to poses
 
 
-def board_pose(lens: LensModel, points: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """X_CT (3, 4) of a planar board by its corners' least squares."""
-    return _boards(lens, points, px)[0].X
-
-
 class _BoardPose(NamedTuple):
     X: np.ndarray  # (3, 4) X_CT
     information: np.ndarray  # (6, 6) by corners with a noise of 1 px

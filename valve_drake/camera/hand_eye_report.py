@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from valve_drake import frames
+from valve_drake import frames, outputs
 from valve_drake.camera import hand_eye as solver
 from valve_drake.camera import hand_eye_mistakes as mistakes
 from valve_drake.camera import hand_eye_page
 from valve_drake.camera.board import Board, find_images, natural
 from valve_drake.camera.calibration_file import load_calibration, save_camera
-from valve_drake.camera.calibration_report import Report, calibrated, finite, look, named
+from valve_drake.camera.calibration_report import Report, calibrated, look, named, some
 from valve_drake.camera.hand_eye_poses import read_poses
 from valve_drake.camera.lens import StereoHead
 from valve_drake.checks import ConfigError
@@ -49,8 +49,8 @@ def hand_eye(
     found = {paths[0].name: px[0] for paths, px in zip(pictures.paths, pictures.corners)}
     names = [name for name, px in found.items() if name in X_BE and px is not None]
     if not names:
-        some = next(iter(found))
-        raise ConfigError(f"--poses {poses}: no pose belongs to an image with the board in it, such as {some}")
+        one = next(iter(found))
+        raise ConfigError(f"--poses {poses}: no pose belongs to an image with the board in it, such as {one}")
     corners = [px for name, px in found.items() if name in names and px is not None]
     seen = solver.observe(lens, board.points(), corners, [X_BE[name] for name in names], to_hand)
     every = tuple(sorted(X_BE, key=natural))
@@ -67,13 +67,13 @@ def hand_eye(
         "no pose for": [name for name in found if name not in X_BE],
         "no image for the pose of": [name for name in every if name not in found],
     }
-    notes += [f"{what} {_some(which)}" for what, which in missing.items() if which]
+    notes += [f"{what} {some(which)}" for what, which in missing.items() if which]
     key = "X_BC" if to_hand else "X_EC"
     X = np.vstack([result.X, [0, 0, 0, 1]])
     where = "the base" if to_hand else "the hand"
     numbers = _numbers(result, names, to_hand, out)
     numbers |= {"not_used": sorted({name for which in missing.values() for name in which}), "warnings": notes}
-    report = Report(finite(numbers), hand_eye_page.page(numbers, corners, pictures.size), _text(numbers))
+    report = Report(outputs.finite(numbers), hand_eye_page.page(numbers, corners, pictures.size), _text(numbers))
     save_camera(lens, out, f"{key}: the camera in {where} (rows of [R | p; 0 0 0 1], m)", **{key: X})
     return report
 
@@ -151,10 +151,6 @@ def _warnings(result: solver.HandEye, board: Board) -> list[str]:
             "more views, turned by 30 deg or more about two axes"
         )
     return out
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def _rms(values: np.ndarray) -> float:

@@ -7,7 +7,7 @@ edge across the marker is evened first, and a colour whose light is clipped take
 import cv2
 import numpy as np
 
-from valve_drake.perception.edges import SidesConfig
+from valve_drake.perception.edges import SidesConfig, within
 from valve_drake.perception.marker import NEXT
 
 # Quadrilaterals from this size on have their colours, and their coarse lines, read at half the resolution, which is
@@ -72,11 +72,6 @@ def _between(core: np.ndarray, ring: np.ndarray, colors: np.ndarray, config: Sid
     return difference
 
 
-def _within(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """np.clip, which takes 20 us more to find out what its limits are."""
-    return np.minimum(np.maximum(values, low), high)
-
-
 def _clipped(part: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None:
     """The share of clipped pixels beside each side, inside or outside, whichever is larger, in each colour: (4, 3);
     and the rows and columns (2, 4, n) of those pixels, inside and outside.
@@ -91,7 +86,7 @@ def _clipped(part: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, tuple[n
     off = min(max(0.12 * float(lengths.min()), 3.0), 6.0) * np.array([[[[1.0]]], [[[-1.0]]]])
     at = corners[:, None] + along[:, None] * _ALONG[:, None] + off * inward[:, None]  # (2, 4, n, 2)
     u, v = np.rint(at).astype(int).transpose(3, 0, 1, 2)
-    beside = _within(v, 0, part.shape[0] - 1), _within(u, 0, part.shape[1] - 1)
+    beside = within(v, 0, part.shape[0] - 1), within(u, 0, part.shape[1] - 1)
     values = part[beside]
     share = ((values >= _BRIGHT) | (values <= _DARK)).mean(2).max(0)
     return (share, beside) if share.any() else None
@@ -145,5 +140,5 @@ def even_light(part: np.ndarray, small: np.ndarray, inside: np.ndarray, step: in
     rows, columns = (np.arange(n)[shape] for n, shape in zip(part.shape, ((..., None), (None, ...))))
     s = np.tanh(((columns - middle[0]) * best[0] + (rows - middle[1]) * best[1]) / size + best[2])
     lit = np.maximum(one, other)
-    part = (part / _within((levels[0] + levels[1] * s[..., None]) / lit, 0.1, 1.0)).astype(np.float32)
+    part = (part / within((levels[0] + levels[1] * s[..., None]) / lit, 0.1, 1.0)).astype(np.float32)
     return part, every_nth(part, step)

@@ -83,6 +83,7 @@ def moments(products: np.ndarray, good: np.ndarray, tau: np.ndarray, terms: Term
 
 
 def normal_density(z: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """phi(z) of an array of any shape."""
     out = np.multiply(z, z, out=out)
     out *= -0.5
     np.exp(out, out=out)

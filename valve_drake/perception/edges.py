@@ -235,7 +235,7 @@ def follow(sheet: Sheet, sides: Sides, config: SidesConfig) -> Followed:
         typical = _median(own.square, profiles.used)[:, None]
         good = profiles.used * (own.square < 6 * typical + 4e-4)
         good *= own.strength > 0.2 * own.strength.max(1, keepdims=True)
-        moved = (curves.inward / curves.cosine)[:, None] * _within(own.shift, -1.5, 1.5)
+        moved = (curves.inward / curves.cosine)[:, None] * within(own.shift, -1.5, 1.5)
         expected = typical / own.strength
         rounds = 2 if last else 1  # outliers are looked for once the model is near
         step, smooth, good = _smooth(profiles.powers, moved, good, bend, np.sqrt(expected), rounds)
@@ -275,7 +275,7 @@ def _products(layout: _Layout, profiles: _Profiles, curves: Curves, blur: np.nda
     # Nothing counts beyond the cut-out's border; and no pixel enters or leaves at once.
     profiles.room = np.minimum(profiles.room, np.minimum(curve - layout.low, layout.high - curve) + 1)
     weight = profiles.room.astype(np.float32)[:, None] - np.abs(z)
-    _within(weight, 0, 1, out=weight)
+    within(weight, 0, 1, out=weight)
     z *= (curves.inward * curves.cosine / blur).astype(np.float32)[:, None, None]
     _, rise, bell, z_bell, _ = profiles.functions.swapaxes(0, 1)
     normal_density(z, out=bell)
@@ -319,11 +319,11 @@ def _next_blur(
     wrong = by_z * (own.left[:, 3] + own.gain * own.shift * products[:, ROW[2][3]])
     scale = by_z * own.gain * products[:, ROW[3][3]]
     change = by_quad(wrong) / np.maximum(by_quad(scale), 1e-12)
-    return _within(blur - _within(change, -0.5, 0.5), 0.35, 3.0), change
+    return within(blur - within(change, -0.5, 0.5), 0.35, 3.0), change
 
 
-def _within(x: np.ndarray, low: float, high: float, out: np.ndarray | None = None) -> np.ndarray:
-    """np.clip takes three times as long on small arrays."""
+def within(x: np.ndarray, low: float, high: float, out: np.ndarray | None = None) -> np.ndarray:
+    """np.clip, which takes three times as long on small arrays."""
     return np.minimum(np.maximum(x, low, out=out), high, out=out)
 
 
@@ -346,7 +346,7 @@ def kept_share(normal: np.ndarray) -> np.ndarray:
     levels, bells = normal[:, :4, :4], normal[:, :4, 4:]
     taken = (bells * np.linalg.solve(levels, bells)).sum(1)
     whole = normal[:, 4:, 4:].diagonal(axis1=1, axis2=2)
-    return _within(1 - (taken / whole).sum(1) / 2, 0.1, 1.0)
+    return within(1 - (taken / whole).sum(1) / 2, 0.1, 1.0)
 
 
 def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -93,6 +93,7 @@ def side_lines(points: np.ndarray, side: np.ndarray, sides: int = 4) -> tuple[np
 
 
 def weighted_lines(points: np.ndarray, side: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The lines (4, 3) of four sides as of `side_lines`, each point (n, 2) with its weight (n,)."""
     _, mean, scatter = side_moments(points, side, weight)
     angle = np.arctan2(2 * scatter[:, 0, 1], scatter[:, 0, 0] - scatter[:, 1, 1]) / 2
     normal = np.stack([-np.sin(angle), np.cos(angle)], -1)

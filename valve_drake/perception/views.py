@@ -36,6 +36,7 @@ class View:
 
 
 def views_of(edges: MarkerEdges, head: StereoHead, config: RectangleEstimatorConfig) -> tuple[list[View], str]:
+    """The one or two cameras whose edges can be used, left first, and ""; or none, and why."""
     views: list[View] = []
     X_RL = frames.inverse(head.X_LR)
     cameras = ((edges.left, head.left, np.eye(3, 4), False), (edges.right, head.right, X_RL, True))

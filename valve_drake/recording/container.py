@@ -115,10 +115,12 @@ class McapFile:
         )
 
     def add_metadata(self, name: str, facts: dict[str, str]) -> None:
+        """Writes a metadata record."""
         offset, length = self._add(records.Metadata(name=name, metadata=facts))
         self._metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
 
     def add_attachment(self, file: records.Attachment) -> None:
+        """Writes an attached file."""
         offset, length = self._add(file)
         self._attachments.append(
             records.AttachmentIndex(

@@ -55,6 +55,7 @@ def nanoseconds(time: float) -> int:
 
 
 def stamp(time: float) -> Timestamp:
+    """Seconds of the station's clock as protobuf's time."""
     seconds, nanos = divmod(nanoseconds(time), NANO)
     return Timestamp(seconds=seconds, nanos=nanos)
 

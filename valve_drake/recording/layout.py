@@ -6,12 +6,11 @@ a topic only when they are told to.
 
 from typing import Any
 
-from valve_drake.messages import SIDES
+from valve_drake.messages import HEAD, SIDES, WRISTS
 from valve_drake.robot.groups import Groups
 
 NAME, MEDIA_TYPE = "layout.json", "application/json"  # of the attachment
 
-HEAD, WRIST = ("head_left", "head_right"), ("left_wrist", "right_wrist")
 VISIBLE_3D = ("/tf", "/scene", "/rectangle_estimator/pose", *(f"/{camera}/calibration" for camera in HEAD))
 JOINT = '/{topic}.joints[:]{{name=="{joint}"}}.position'
 TRACKED = 3  # joints of each arm that are plotted, from the shoulder on
@@ -59,10 +58,10 @@ def layout(groups: Groups) -> dict[str, Any]:
         "3D!world": world,
         "StateTransitions!modes": modes,
         "RosOut!log": {"searchTerms": [], "minLogLevel": 1},
-        **{f"Image!{camera}": _image(camera) for camera in (*HEAD, *WRIST)},
+        **{f"Image!{camera}": _image(camera) for camera in (*HEAD, *WRISTS)},
         **{f"Plot!{title}": _plot(title, paths) for title, paths in plots.items()},
     }
-    head, wrist = ([f"Image!{camera}" for camera in cameras] for cameras in (HEAD, WRIST))
+    head, wrist = ([f"Image!{camera}" for camera in cameras] for cameras in (HEAD, WRISTS))
     curves = [f"Plot!{title}" for title in plots]
     tree = _split(
         "row",

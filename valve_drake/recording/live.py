@@ -54,6 +54,7 @@ class LiveView:
 
     @property
     def port(self) -> int:
+        """Where the server listens."""
         return self._server.port
 
     def write(self, topic: str, message: schemas.Loggable, time: float) -> None:
@@ -72,6 +73,7 @@ class LiveView:
         """Does nothing: no message is buffered."""
 
     def close(self) -> None:
+        """Ends the server."""
         self._server.stop()
 
     def __enter__(self) -> Self:

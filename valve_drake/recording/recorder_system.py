@@ -21,9 +21,11 @@ ONCE = math.inf  # a period: at the start only
 class Sink(Protocol):
     """Where the recorder writes: writer.LogWriter, or a live view."""
 
-    def write(self, topic: str, message: Loggable, time: float) -> None: ...
+    def write(self, topic: str, message: Loggable, time: float) -> None:
+        """Takes a message of `topic` at `time` [s]."""
 
-    def flush(self) -> None: ...
+    def flush(self) -> None:
+        """What was written is to survive a crash."""
 
 
 class Tee:

@@ -21,7 +21,7 @@ class RobotFrames:
     ("robot::chest"), so that the bodies' looks move with them."""
 
     def __init__(self, robot: Robot, head: StereoHead):
-        self._model = shared = robot.model
+        shared = robot.model
         self._plant, instance = shared.plant, shared.robot
         self._context = self._plant.CreateDefaultContext()
         self._q = np.array(self._plant.GetPositions(self._context))

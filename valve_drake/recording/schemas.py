@@ -48,7 +48,7 @@ _SCALARS: dict[type, tuple[int, Callable[[Any], bytes], type]] = {  # protobuf's
     bytes: (_Field.TYPE_BYTES, bytes, bytes),
 }
 _ZERO = bytes(8)  # 0.0
-LISTS = 256  # of texts whose bytes are kept, since most are as before, a field; raise it for a log of many devices
+LISTS = 256  # different lists of texts whose bytes a field keeps, most come again; raise it for a log of many devices
 _POOL = descriptor_pool.DescriptorPool()
 
 

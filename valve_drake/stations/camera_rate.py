@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 
 from valve_drake.checks import require
-from valve_drake.stations.contract import CAMERAS
+from valve_drake.messages import CAMERAS
 from valve_drake.stations.simulation_config import CameraConfig
 
 SECOND = 1.0  # between two judgements [s, wall]
@@ -18,11 +18,6 @@ BEHIND = 0.03  # share of a second that may be lost; raise it for a machine whos
 ROOM = 4  # seconds without loss before the cameras are faster again; doubled whenever that was too early
 MOST_ROOM = 64
 HOPELESS = 0.5  # share of a second that was lost: no program can work with that, and it is told why
-
-
-def camera_periods(camera: CameraConfig) -> dict[str, float]:
-    """Between two captures [s]."""
-    return {name: camera.head_period if name.startswith("head") else camera.wrist_period for name in CAMERAS}
 
 
 @dc.dataclass(frozen=True)
@@ -41,7 +36,7 @@ def limits(camera: CameraConfig, max_age: Mapping[str, float]) -> Limits:
     Raises ConfigError for a camera that is slower than that by its own period.
     """
     least = min(max_age[name] for name in CAMERAS)
-    fastest = camera_periods(camera)
+    fastest = {name: camera.period(name) for name in CAMERAS}
     for key, period in (("head_period", camera.head_period), ("wrist_period", camera.wrist_period)):
         rule = f"for a twin at most half of supervisor.max_age of the cameras, {least / 2:g} s"
         require(period <= least / 2, f"simulation.camera.{key}", rule, period)

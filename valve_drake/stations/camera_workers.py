@@ -26,10 +26,10 @@ import numpy as np
 from valve_drake import profiling
 from valve_drake.beside import can_fork, fork
 from valve_drake.checks import OperationFailed
-from valve_drake.messages import CameraFrame
+from valve_drake.messages import CAMERAS, HEAD, WRISTS, CameraFrame
 from valve_drake.stations import render_egl
 from valve_drake.stations.camera_rig import CameraRig, Capture, decoded
-from valve_drake.stations.contract import CAMERAS, HEAD, MATE, WRISTS
+from valve_drake.stations.contract import MATE
 
 WORKERS = 2
 NICENESS = 5  # of the processes: the run goes first where processors are few. 0 where a late image does more harm

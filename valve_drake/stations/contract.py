@@ -9,11 +9,9 @@ from collections.abc import Callable, Mapping
 
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, PortDataType
 
-from valve_drake.messages import CAMERAS as CAMERAS
-from valve_drake.messages import SIDES, CameraFrame, Health
+from valve_drake.messages import CAMERAS, HEAD, SIDES, WRISTS, CameraFrame, Health
 from valve_drake.robot.groups import Groups
 
-HEAD, WRISTS = CAMERAS[:2], CAMERAS[2:]
 MATE = {HEAD[0]: HEAD[1], HEAD[1]: HEAD[0], WRISTS[0]: WRISTS[1], WRISTS[1]: WRISTS[0]}  # the other one of a pair
 TRUTH = "truth."
 SAID_BY = {  # devices that a robot may lack (Groups.absent) -> the port that shows what they say

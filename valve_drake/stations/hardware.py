@@ -33,13 +33,13 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, State
 from valve_drake import profiling
 from valve_drake.checks import ConfigError, OperationFailed
 from valve_drake.console import complain
-from valve_drake.messages import SIDES, CameraFrame, Health
+from valve_drake.messages import CAMERAS, HEAD, SIDES, CameraFrame, Health
 from valve_drake.ports import SLOT, TICK, PythonSystem
 from valve_drake.robot.groups import GROUPS, Groups
 from valve_drake.robot.robot import Robot
 from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rig import decode_image
-from valve_drake.stations.contract import CAMERAS, CONTRACT, HEAD, SAID_BY, station_of, vectors
+from valve_drake.stations.contract import CONTRACT, SAID_BY, station_of, vectors
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
@@ -135,6 +135,7 @@ class CameraRequests:
         return changed
 
     def message(self) -> dict[str, float]:
+        """Of every camera whether it is requested, 1 or 0."""
         return {camera: float(camera in self.since) for camera in CAMERAS}
 
 

@@ -27,12 +27,11 @@ from drake import (
 from valve_drake.camera.image_file import jpeg_size
 from valve_drake.checks import require
 from valve_drake.config import Config, number, numbers, plain, texts
-from valve_drake.messages import POSE_HISTORY, SIDES, CameraFrame, Mode
+from valve_drake.messages import CAMERAS, POSE_HISTORY, SIDES, CameraFrame, Mode
 from valve_drake.ports import SLOT, TICK
 from valve_drake.processor import HIGHEST
 from valve_drake.robot.drive import SPEEDS
 from valve_drake.robot.groups import POSE, Groups
-from valve_drake.stations.contract import CAMERAS
 from valve_drake.stations.network import LOOPBACK, NAME, group_of
 
 PROTOCOL = 1  # version of this table; a robot that speaks another one is refused
@@ -81,6 +80,7 @@ class Channel:
         return "VALVE_" + self.key.replace(".", "_").upper()
 
     def encode(self, utime: int, values: Values) -> Any:
+        """The message of `values`, stamped `utime` [us]."""
         if self.write is None:
             raise TypeError(f"{self.key}: its sender makes the message")
         message = self.write(values)

@@ -29,7 +29,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, Diagram
 
 from valve_drake.checks import ConfigError
-from valve_drake.messages import SIDES, CameraFrame, Health, Message, OperatorCommand, OperatorPackets
+from valve_drake.messages import CAMERAS, SIDES, CameraFrame, Health, Message, OperatorCommand, OperatorPackets
 from valve_drake.ports import TICK, PythonSystem
 from valve_drake.recording.foxglove import NANO, nanoseconds
 from valve_drake.recording.reader import LogReader, Record
@@ -37,7 +37,7 @@ from valve_drake.recording.schemas import Wrench, proto_class
 from valve_drake.recording.signals import FRAMES, JOINED, measured, topic_of
 from valve_drake.robot.groups import Groups
 from valve_drake.stations.camera_rig import decode_image
-from valve_drake.stations.contract import CAMERAS, CONTRACT, PortSpec, station_of, vectors
+from valve_drake.stations.contract import CONTRACT, PortSpec, station_of, vectors
 
 JOINTS, HEALTH, OPERATOR, PACKETS = "/joint_states", "/health", "/operator/command", "/operator/packets"
 CONSUMERS = {topic_of(port) for port, _, _ in FRAMES.values()}
@@ -73,6 +73,7 @@ class Track:
         self.values = list(values)
 
     def add(self, time: float, value: Any) -> None:
+        """The value from `time` on, which is not before the last one's [s]."""
         self.times.append(time)
         self.values.append(value)
 
@@ -133,6 +134,7 @@ class Recording:
         return self._log.records(self._log.topics.keys() & topics)
 
     def decode(self, record: Record) -> Any:
+        """The message of a record. Raises ConfigError if this version of the program cannot hold it."""
         return self._log.decode(record)
 
     def frame(self, time: float, header: CameraFrame) -> CameraFrame:

@@ -25,7 +25,7 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from valve_drake.camera.lens import Lens, StereoHead
 from valve_drake.frames import compose, make, rotation
-from valve_drake.messages import DEVICES, LEFT, SIDES, CameraFrame, Health
+from valve_drake.messages import CAMERAS, DEVICES, LEFT, SIDES, WRISTS, CameraFrame, Health
 from valve_drake.ports import TICK, Block, Inputs, Outputs, PythonSystem
 from valve_drake.robot.description import ArmDescription, RobotDescription
 from valve_drake.robot.drive import DIFFERENTIAL, Drive, whole
@@ -33,7 +33,7 @@ from valve_drake.robot.groups import POSE
 from valve_drake.robot.robot import Robot
 from valve_drake.stations.camera_rig import CameraSystem, Images, Mount, RigWhenRead
 from valve_drake.stations.camera_workers import CameraWorkers
-from valve_drake.stations.contract import CAMERAS, TRUTH, WRISTS, check_contract
+from valve_drake.stations.contract import TRUTH, check_contract
 from valve_drake.stations.mishaps import LostGripSystem, WheelSlipSystem, slips
 from valve_drake.stations.plant_system import COMMANDS, STEM, PlantSystem
 from valve_drake.stations.rails import STAND
@@ -446,8 +446,8 @@ def make_simulated_station(
         nothing = builder.AddNamedSystem(name, ConstantValueSource(Value(CameraFrame(camera=name))))
         builder.ExportOutput(nothing.get_output_port(), f"{name}.image")
     for name in [name for name in CAMERAS if name not in missing]:
-        period = camera.head_period if name.startswith("head") else camera.wrist_period
-        system = builder.AddSystem(CameraSystem(name, plant.num_positions(), period, camera.latency, images))
+        made = CameraSystem(name, plant.num_positions(), camera.period(name), camera.latency, images)
+        system = builder.AddSystem(made)
         builder.Connect(ports[POSITIONS], system.GetInputPort("positions"))
         builder.ExportOutput(system.GetOutputPort("image"), f"{name}.image")
 

@@ -5,7 +5,7 @@ import math
 
 from valve_drake.checks import require
 from valve_drake.config import Config, Number, choice, number, numbers, plain
-from valve_drake.messages import SIDES
+from valve_drake.messages import HEAD, SIDES
 from valve_drake.ports import TICK
 
 
@@ -98,6 +98,10 @@ class CameraConfig(Config):
         for name in ("head_period", "wrist_period", "latency"):
             ticks = getattr(self, name) / TICK
             require(ticks == int(ticks), f"{key}.{name}", "a multiple of 1/128 s", getattr(self, name))
+
+    def period(self, camera: str) -> float:
+        """Between two captures of a camera [s]."""
+        return self.head_period if camera in HEAD else self.wrist_period
 
 
 @dc.dataclass

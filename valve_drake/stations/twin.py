@@ -27,7 +27,7 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram
 
-from valve_drake.messages import CameraFrame
+from valve_drake.messages import CAMERAS, CameraFrame
 from valve_drake.motion import slew
 from valve_drake.ports import SLOT, TICK
 from valve_drake.processor import YIELDING, hurries
@@ -37,7 +37,7 @@ from valve_drake.stations.bus import BadMessage, Bus
 from valve_drake.stations.camera_rate import SECOND, CameraRate
 from valve_drake.stations.camera_rig import Capture
 from valve_drake.stations.camera_workers import CameraWorkers
-from valve_drake.stations.contract import CAMERAS, CONTRACT, MATE
+from valve_drake.stations.contract import CONTRACT, MATE
 from valve_drake.stations.faults import Faults, Wire
 from valve_drake.stations.lcm_channels import (
     CHANNELS,
@@ -348,6 +348,7 @@ class Twin:
         return self._bad.counts
 
     def read(self, port: str) -> np.ndarray:
+        """What an output port of the station shows now; a CameraFrame of a camera's."""
         return self.station.GetOutputPort(port).Eval(self.context)
 
     def _set(self, values: Mapping[str, np.ndarray]) -> None:
@@ -470,8 +471,8 @@ class Twin:
             return self._images.ready()
         frames = []
         for camera in sorted(wanted):
-            period = self._camera.head_period if camera.startswith("head") else self._camera.wrist_period
-            there = math.floor((time - TICK - self._camera.latency) / period)  # delivered before this tick
+            # Delivered before this tick.
+            there = math.floor((time - TICK - self._camera.latency) / self._camera.period(camera))
             if there > self._shown[camera]:
                 frame: Any = self.read(f"{camera}.image")
                 self._shown[camera] = frame.sequence
