@@ -121,7 +121,7 @@ def facts(review: Review) -> dict[str, Any]:
 
 
 @dc.dataclass
-class Comparison:
+class SideBySide:
     """Everything that is known of two logs side by side."""
 
     a: Review
@@ -143,9 +143,9 @@ class Comparison:
         return self.a.integrity.sound and self.b.integrity.sound
 
 
-def compare(a: Review, b: Review) -> Comparison:
+def compare(a: Review, b: Review) -> SideBySide:
     """Two logs side by side."""
-    return Comparison(
+    return SideBySide(
         a,
         b,
         two_logs.pair_modes(a.traces.spans, b.traces.spans),
@@ -156,7 +156,7 @@ def compare(a: Review, b: Review) -> Comparison:
     )
 
 
-def comparison_facts(comparison: Comparison) -> dict[str, Any]:
+def comparison_facts(comparison: SideBySide) -> dict[str, Any]:
     """The object of `review A B --json`."""
     pairs = [
         {"mode": one.mode, "a_s": x.duration if x else None, "b_s": y.duration if y else None}
@@ -260,7 +260,7 @@ def page(review: Review, link_base: Path) -> str:
 # ---------------------------------------------------------------- the page of two
 
 
-def comparison_page(comparison: Comparison, link_base: Path) -> str:
+def comparison_page(comparison: SideBySide, link_base: Path) -> str:
     """The page of two logs; links are relative to the folder `link_base`."""
     a, b = comparison.a, comparison.b
     spans = a.traces.spans

@@ -11,7 +11,7 @@ from valve_drake.console import console as make_console
 from valve_drake.console import say, styled
 
 if TYPE_CHECKING:
-    from valve_drake.analysis.report import Comparison, Review
+    from valve_drake.analysis.report import Review, SideBySide
 
 MOST_TOPICS = 30  # of another program's log, on the terminal
 
@@ -79,7 +79,7 @@ def _print_review(one: "Review", name: str) -> None:
     console.print(f"the log is {whole}: {one.integrity.messages} messages, {len(one.integrity.topics)} topics")
 
 
-def _print_parting(both: "Comparison") -> None:
+def _print_parting(both: "SideBySide") -> None:
     """Where two logs part."""
     from valve_drake.analysis import report
 

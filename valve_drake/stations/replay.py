@@ -65,7 +65,7 @@ def schemas_of(vectors: Iterable[str]) -> dict[str, str]:
     )
 
 
-class Track:
+class History:
     """What one port showed: values by the time of the tick that recorded them."""
 
     def __init__(self, times: Iterable[float] = (), values: Iterable[Any] = ()) -> None:
@@ -86,7 +86,7 @@ class Recording:
     """All that a log holds of the machine that it was recorded from.
 
     end: the last tick up to which everything is there [s]; a damaged log is replayed up to its damage.
-    tracks: Track by port of the contract: arrays, Health, or (time, CameraFrame without its image).
+    histories: History by port of the contract: arrays, Health, or (time, CameraFrame without its image).
     joined: the same of the ports of the recorder that join several (signals.JOINED).
     requests: the program's own commands. packets: what operators have sent.
     groups: the joints of the robot that was recorded.
@@ -95,9 +95,9 @@ class Recording:
 
     def __init__(self, log: LogReader, groups: Groups):
         self._log, self.groups = log, groups
-        self.tracks: dict[str, Track] = collections.defaultdict(Track)
-        self.joined: dict[str, Track] = {}
-        self.requests, self.packets = Track(), Track()
+        self.histories: dict[str, History] = collections.defaultdict(History)
+        self.joined: dict[str, History] = {}
+        self.requests, self.packets = History(), History()
         topics = _vectors(groups)
         needed = {HEALTH, OPERATOR, *topics, *CONSUMERS}
         if missing := sorted(needed - {name for name, topic in log.topics.items() if topic.count > 0}):
@@ -118,14 +118,14 @@ class Recording:
             elif topic in CONSUMERS:
                 self._add_frames(topic, time, log.decode(record))
             else:
-                track = {OPERATOR: self.requests, PACKETS: self.packets, HEALTH: self.tracks["health"]}[topic]
-                track.add(time, log.decode(record))
+                history = {OPERATOR: self.requests, PACKETS: self.packets, HEALTH: self.histories["health"]}[topic]
+                history.add(time, log.decode(record))
         for topic, ports in topics.items():
             self._add_vectors(vectors[topic], ports)
         self.end = self._sound_end()
         for camera in CAMERAS:
-            track = self.tracks[f"{camera}.image"]
-            for time, frame in track.values:
+            history = self.histories[f"{camera}.image"]
+            for time, frame in history.values:
                 if frame.sequence >= 0 and time <= self.end and (f"/{camera}/image", time) not in images:
                     raise ConfigError(f"{log.path} lacks the image {frame.sequence} of {camera} at t = {time:.3f} s")
 
@@ -162,21 +162,21 @@ class Recording:
                 if path not in table.columns or path in table.gaps:
                     raise ConfigError(f"{self._log.path}: {topic} has no {path.removeprefix(_JOINT)}")
             values = table.values[:, [table.columns[path] for path in paths]]
-            (self.joined if port in JOINED else self.tracks)[port] = Track(times, values)
+            (self.joined if port in JOINED else self.histories)[port] = History(times, values)
 
     def _add_frames(self, topic: str, time: float, message: Any) -> None:
         for camera, (port, _, frame) in FRAMES.items():
             if topic_of(port) != topic:
                 continue
-            header, track = frame(message), self.tracks[f"{camera}.image"]
-            if not track.values:
-                track.add(0.0, (0.0, CameraFrame(camera=camera)))  # before the first capture
-            if header.sequence != track.values[-1][1].sequence:
-                track.add(time, (time, header))
+            header, history = frame(message), self.histories[f"{camera}.image"]
+            if not history.values:
+                history.add(0.0, (0.0, CameraFrame(camera=camera)))  # before the first capture
+            if header.sequence != history.values[-1][1].sequence:
+                history.add(time, (time, header))
 
     def _sound_end(self) -> float:
         """Every tick is in JOINTS: the first one that is missing tells where something was lost."""
-        times = self.tracks["base.odometry"].times
+        times = self.histories["base.odometry"].times
         count = next((k for k, time in enumerate(times) if time != k * TICK), len(times))
         damaged = self._log.damage or self._log.past_damage
         last = count - 1 - bool(damaged or count < len(times))  # of the last tick before a loss some may be missing
@@ -216,7 +216,7 @@ def shown(recording: Recording) -> dict[str, Callable[[float], Any]]:
     frame = functools.lru_cache(maxsize=len(CAMERAS))(recording.frame)
 
     def reader(spec: PortSpec) -> Callable[[float], Any]:
-        at = recording.tracks[spec.name].at
+        at = recording.histories[spec.name].at
         if not isinstance(spec.kind, type):
             return at
         if spec.kind is CameraFrame:
