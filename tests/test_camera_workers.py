@@ -1,8 +1,10 @@
 """camera_workers: makes the same images as CameraRig in other processes, and begins them early."""
 
+import errno
 import gc
 import os
 import pickle
+import signal
 import subprocess
 import sys
 
@@ -13,6 +15,7 @@ from robot_facts import ROBOT
 from valve_drake import named_files, scenario
 from valve_drake.camera.lens import load_head
 from valve_drake.checks import OperationFailed
+from valve_drake.stations import camera_workers
 from valve_drake.stations.camera_rig import CameraRig, Capture
 from valve_drake.stations.camera_workers import CameraWorkers
 from valve_drake.stations.lcm_channels import image_message
@@ -47,6 +50,22 @@ def captures(rig, count, offset=0.0):
         q[rig.plant.GetJointByName("neck_yaw").position_start()] = offset + 0.02 * k
         out.append(Capture(k / 8, k, q))
     return out
+
+
+def test_where_not_all_processes_can_be_started_none_stays(monkeypatch):
+    started = []
+
+    def spawn(fd, niceness):
+        if started:
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        started.append(subprocess.Popen(["sleep", "60"]))
+        return started[0], started[0].wait
+
+    monkeypatch.setattr(camera_workers, "_can_fork", lambda: False)
+    monkeypatch.setattr(camera_workers, "_spawn", spawn)
+    with pytest.raises(OperationFailed, match="no process to render in can be started: Resource"):
+        CameraWorkers("rig").__enter__()
+    assert started[0].poll() == -signal.SIGTERM
 
 
 @pytest.mark.system

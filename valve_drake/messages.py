@@ -414,7 +414,7 @@ class ModeState(Message):
     activation: int = 0
     since: float = 0.0  # when this mode was entered [s]
     attempt: int = 0  # retries of this mode so far
-    turn_angle: float = 0.0  # commanded turn, positive opens (counter-clockwise seen from the robot) [rad]
+    turn_angle: float = 0.0  # commanded turn, counter-clockwise for the robot [rad]
     verdict: str = Verdict.NONE.value
     reason: str = ""
     head_every: int = 0  # perception looks at every n-th pair of the head's images; 0: at none
@@ -464,7 +464,7 @@ class PlanRequest(Message):
     valve: bool = False  # there is a valve, at X_BA
     X_BA: np.ndarray = transform()  # its axis frame (valve/valve.py)
     posture: np.ndarray = array(-1)  # lift and waist as measured [m, rad]
-    turn_angle: float = 0.0  # positive opens [rad]
+    turn_angle: float = 0.0  # counter-clockwise for the robot [rad]
     start: np.ndarray = array(-1)  # both arms, left first [rad]
     goal: np.ndarray = array(-1)
 

@@ -177,7 +177,7 @@ def _angle(log: Traces) -> Plot:
     if log.camera_angle is not None:
         time, angle = log.camera_angle
         lines.append(Line("by the head cameras", time, scale * angle, BLUE, "dots"))
-    return Plot("Valve angle, positive opens", "deg", lines, height=170, key="valve_angle")
+    return Plot("Valve angle, counter-clockwise for the robot", "deg", lines, height=170, key="valve_angle")
 
 
 def _angle_difference(log: Traces) -> Plot:

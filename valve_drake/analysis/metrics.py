@@ -62,7 +62,10 @@ class TrackingNumbers:
 
 @dc.dataclass
 class Summary:
-    """A run in numbers; None where the log does not say. Angles are turned since the start, positive opens."""
+    """A run in numbers; None where the log does not say.
+
+    Angles are turned since the start, counter-clockwise for the robot.
+    """
 
     outcome: str = ""  # done | failed | stopped | "" (did not finish)
     verdict: str = ""

@@ -122,7 +122,7 @@ class Truth:
     time: np.ndarray  # (N,) [s]
     base: np.ndarray  # x, y [m], heading [rad] in W, continuous (N, 3)
     X_WV: np.ndarray  # (N, 3, 4)
-    angle: np.ndarray  # turned since the start, positive opens (N,) [rad]
+    angle: np.ndarray  # turned since the start, counter-clockwise for the robot (N,) [rad]
 
 
 @dc.dataclass(frozen=True)

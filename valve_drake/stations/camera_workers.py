@@ -52,7 +52,7 @@ class _Worker:
 class CameraWorkers:
     """Makes images in other processes while open. Use: `with CameraWorkers(*rig) as workers:`; rig: of CameraRig.
 
-    niceness: of the processes, as os.nice takes it.
+    niceness: of the processes, as os.nice takes it. Entering raises OperationFailed if they cannot be started.
 
     A process with one thread is forked, which spares the workers the imports and each a rig of its own; one with more
     cannot be forked safely, and starts new ones. So it is cheapest to enter before anything that keeps a thread.
@@ -70,6 +70,16 @@ class CameraWorkers:
 
     def __enter__(self) -> "CameraWorkers":
         rig = CameraRig(*self._rig) if _can_fork() else None
+        try:
+            self._start(rig)
+        except BaseException as error:  # those that run already must not stay
+            self.__exit__()
+            if isinstance(error, OSError):
+                raise OperationFailed(f"no process to render in can be started: {error.strerror}") from error
+            raise
+        return self
+
+    def _start(self, rig: CameraRig | None) -> None:
         for _ in range(WORKERS):
             here, there = socket.socketpair()
             wire = multiprocessing.connection.Connection(here.detach())
@@ -82,7 +92,6 @@ class CameraWorkers:
                     process, wait = _spawn(there.fileno(), self._niceness)
                     self._workers.append(_Worker(process, wait, wire))
                     _send(wire, self._rig)
-        return self
 
     def __exit__(self, *_: object) -> None:
         for worker in self._workers:
