@@ -191,7 +191,7 @@ REAL = {
         TIAGO,
         [
             (MISSING, "search head_calibration: none: there is no second eye"),
-            (MISSING, "servo cameras.left_wrist: no camera"),
+            (NOTE, "servo servo: none"),
             (MISSING, "reach : the scenario's valve at 0.5 m is out of reach"),
             (DOUBTFUL, "grasp grippers.left: its motor closes with"),
             (NOTE, "grasp opening: the fingers open by 71 mm"),
@@ -212,7 +212,6 @@ REAL = {
         VEGA,
         [
             (MISSING, "search head_calibration: none: there is no second eye"),
-            (MISSING, "opening must be at most command_selector.gripper_high"),
             (DOUBTFUL, "grasp pad.at: open, the fingers' shapes are"),
         ],
         {0.5: False, 1.0: False},

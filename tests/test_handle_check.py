@@ -13,7 +13,7 @@ from valve_drake.collision import CollisionModel
 from valve_drake.diagram import make_blocks
 from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
-from valve_drake.valve.valve import HandleConfig, MarkerConfig, Valve
+from valve_drake.valve.valve import HandleConfig, MarkerConfig, PanelConfig, Valve
 
 VALVE = Valve()
 
@@ -49,6 +49,23 @@ def test_a_wheel_whose_spokes_are_where_hands_would_be_is_refused_by_its_spokes(
     with pytest.raises(ConfigError, match=r"valve.spokes must be fewer, or farther from valve.handles\[0\]: .*got 5"):
         check(spoked(5))
     check(spoked(4))
+
+
+def test_a_panel_that_hands_touch_is_refused_with_the_least_depth_which_will_do():
+    def near(depth: float) -> Valve:
+        return made(0.15, panel=PanelConfig(depth=depth))
+
+    with pytest.raises(ConfigError) as error:
+        check(near(0.025))
+    said = re.fullmatch(
+        r"valve\.panel\.depth must be at least (0\.0\d+): an open hand at valve\.handles\[0\] touches the panel or is "
+        r"nearer than collision\.padding, got 0\.025",
+        str(error.value),
+    )
+    assert said, error.value
+    check(near(float(said[1])))
+    with pytest.raises(ConfigError, match="valve.panel.depth must be at least"):
+        check(near(float(said[1]) - 0.003))
 
 
 def test_two_hands_need_two_handles_that_they_can_be_at():

@@ -506,7 +506,8 @@ USELESS = {
     "a handle that open fingers are too near to": (
         [],
         ["valve.model=''", "valve.handles=[{xyz: [0.15, 0, 0], width: 0.056}, {xyz: [-0.15, 0, 0]}]"],
-        "opening must be at least 0.086: valve.handles.width and 0.015 to either side (collision.padding), got 0.085",
+        "opening must be at least 0.086: valve.handles.width and 0.015 to either side (collision.padding), "
+        "or the handles at most 0.055 wide, got 0.085",
     ),
     "a selector that shuts the hands": ([], ["command_selector.gripper_high=0.08"], "opening must be at most command_"),
 }

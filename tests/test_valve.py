@@ -1,5 +1,7 @@
 """The valve as one value: what its keys refuse, its grasps and marks, its model in Drake."""
 
+import re
+
 import numpy as np
 import pytest
 from pydrake.geometry import Box
@@ -13,6 +15,7 @@ from valve_drake.behaviors.stance_config import StanceConfig
 from valve_drake.behaviors.stance_search import Stances
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
+from valve_drake.diagram import make_blocks
 from valve_drake.frames import compose, inverse, make, rot_y, rot_z, wrap
 from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
@@ -40,6 +43,7 @@ def valve(text: str) -> Valve:
 
 PANEL = "valve: {marker: {carrier: panel, size: [0.06, 0.06], xyz: %s}}"
 HANDLES = "valve: {model: '', handles: [%s]}"
+RIMS = "{kind: rim, xyz: [0.2, 0, 0]}, {kind: rim, xyz: [-0.2, 0, 0]}"
 GOOD = "{xyz: [0.15, 0, 0]}, {xyz: [-0.15, 0, 0]}"
 
 WRONG = {
@@ -67,6 +71,19 @@ WRONG = {
     HANDLES % (GOOD + ", {xyz: [0, 0.15, 0], width: 0.2}"): "valve.handles[2].width must be within",
     HANDLES % (GOOD + ", {xyz: [0, 0.15, 0], along: [0, 0, 1]}"): "valve.handles[2].along must be a direction across",
     HANDLES % "{xyz: [0.15, 0, 0]}, {xyz: [0.14, 0.05, 0]}": "valve.handles must be two of them at least 0.12 m apart",
+    HANDLES % "{kind: bar}, {kind: bar}": (
+        "valve.handles[1].xyz must be a place of its own, 0.02 m or more from valve.handles[0], got [0.15, 0.0, 0.0]"
+    ),
+    HANDLES % (GOOD + ", {xyz: [0.15, 0.01, 0]}"): "valve.handles[2].xyz must be a place of its own",
+    HANDLES % "{xyz: [0.1, 0, 0], length: 0.25}, {xyz: [-0.1, 0, 0]}": (
+        "valve.handles[0].length must be at most 0.2: it reaches beyond the axis, got 0.25"
+    ),
+    "valve: {model: '', marker: {xyz: [0, 0, 0.05]}}": (
+        "valve.marker.xyz must be before the valve's bars and spokes, z at most -0.0125: they hide it, got [0.0"
+    ),
+    HANDLES[:-1] % RIMS + ", marker: {xyz: [0, 0, 0]}}": (
+        "valve.marker.xyz must be before the valve's bars and spokes, z at most -0.008"
+    ),
     HANDLES % "{xyz: [0.15, 0, 0]}, {xyz: [0.15, 0, -0.2]}": "two of them at least 0.12 m apart across the axis",
     HANDLES % "{xyz: [0.15, 0, 0], kind: rim}, {xyz: [-0.2, 0, 0], kind: rim}": "as far from the axis as all others",
     HANDLES
@@ -77,6 +94,26 @@ WRONG = {
     "valve: {panel: {depth: -1}}": "valve.panel.depth must be within",
     "valve: {obstacles: [{size: [1, 1]}]}": "valve.obstacles[0].size must be 3 values",
 }
+
+
+def test_a_marker_behind_the_bars_is_seen_where_none_passes_before_it():
+    aside = "{model: '', marker: {xyz: [0, 0.12, 0.03], size: [0.06, 0.06], face: 0.07}}"
+    assert valve("valve: " + aside).marker.xyz == [0, 0.12, 0.03]
+    with pytest.raises(ConfigError, match="valve.marker.xyz must be before the valve's bars and spokes"):
+        valve("valve: " + aside.replace("0.12, 0.03", "0.03, 0.03"))
+
+
+@pytest.mark.parametrize(("distance", "side"), [(2.5, 0.012), (5.0, 0.02)])
+def test_a_marker_too_small_to_be_seen_at_the_start_is_refused_with_the_size_that_will_do(distance, side):
+    """60 px^2 are needed: what is seen of it grows with the nearness of the start."""
+    keys = [f"simulation.start.distance={distance}", "valve.model=''"]
+    with pytest.raises(ConfigError) as error:
+        make_blocks(scenarios.load(None, [*keys, f"valve.marker.size=[{side}, {side}]"]))
+    words = r"valve\.marker\.size must be at least \[(0\.\d+), \1\]: .* color_segmentation.min_area is 60"
+    said = re.match(words, str(error.value))
+    assert said and float(said[1]) > side, error.value
+    enough = float(said[1]) + 0.001
+    make_blocks(scenarios.load(None, [*keys, f"valve.marker.size=[{enough}, {enough}]"]))
 
 
 @pytest.mark.parametrize("text", WRONG)

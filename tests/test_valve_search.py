@@ -282,8 +282,18 @@ def test_aim_puts_a_point_on_the_optical_axis(waist, point):
     assert z > 0 and np.hypot(x, y) / z < 1e-4
 
 
-def gaze(mode: str, p_OV: np.ndarray, seconds: float, *, base=lambda t: np.zeros(3), source="position", torso=None):
-    """Gaze in one mode on a marker that is always seen -> torsos (n, 3), last status, memory."""
+def gaze(
+    mode: str,
+    p_OV: np.ndarray,
+    seconds: float,
+    *,
+    base=lambda t: np.zeros(3),
+    source="position",
+    torso=None,
+    config=CONFIG,
+    until=np.inf,
+):
+    """Gaze in one mode on a marker that is always seen, `until` then -> torsos (n, 3), last status, memory."""
     memory = Memory()
     torso = np.zeros(3) if torso is None else torso
     torsos = []
@@ -293,13 +303,15 @@ def gaze(mode: str, p_OV: np.ndarray, seconds: float, *, base=lambda t: np.zeros
         X_OL = HEAD(pose, torso)
         p_L = apply(inverse(X_OL), p_OV)
         position, estimate = StereoPosition(), RectangleEstimate()
-        if source == "position":
+        if t > until:
+            pass
+        elif source == "position":
             position = StereoPosition(time=t, found=True, p_LV=p_L, X_OL=X_OL)
         elif source == "estimate":
             estimate = RectangleEstimate(time=t, found=True, X_LV=make(np.eye(3), p_L), X_OL=X_OL)
         robot = RobotState(time=t, odometry=np.array([*pose, 0, 0]), torso=torso, history=np.zeros((1, 7)))
         state = ModeState(mode=mode, activation=2)
-        memory, command, status = step(CONFIG, memory, t, DT, robot, state, position, estimate, HEAD)
+        memory, command, status = step(config, memory, t, DT, robot, state, position, estimate, HEAD)
         torso = command.torso
         torsos.append(torso)
     return np.array(torsos), status, memory
@@ -427,6 +439,21 @@ def test_a_lost_marker_fails_where_it_matters_and_nowhere_else(mode):
 def test_a_marker_that_is_seen_is_not_lost():
     _, status, _ = gaze("measure", np.array([1.0, 0.0, 1.0]), CONFIG.lost_after + 0.5)
     assert status.state == "running"
+
+
+def test_a_marker_that_a_stiff_neck_cannot_face_is_not_lost_while_the_base_drives_across():
+    """A base that drives aside to its stance turns from the marker by more than neck and waist make up for."""
+    stiff = dc.replace(CONFIG, yaw_limit=0.5, sweep_yaw=0.5, sweep_waist=0.0)
+
+    def base(t):
+        return np.array([0.0, 0.0, 1.6 if 0.5 < t < 5.0 else 0.0])
+
+    def state(mode, seconds):
+        return gaze(mode, np.array([2.0, 0.0, 1.0]), seconds, base=base, config=stiff, until=0.5)[1].state
+
+    assert state("fine_approach", 4.9) == "running" and state("measure", 4.9) == "failed"
+    assert state("fine_approach", 5.0 + CONFIG.lost_after - 0.1) == "running"
+    assert state("fine_approach", 5.0 + CONFIG.lost_after + 0.1) == "failed", "it faces where the marker was"
 
 
 # ---------------------------------------------------------------- block

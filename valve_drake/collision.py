@@ -22,7 +22,7 @@ from valve_drake.frames import compose, inverse
 from valve_drake.messages import SIDES
 from valve_drake.robot import description, xml_file
 from valve_drake.robot.robot import Robot
-from valve_drake.valve.valve import turned
+from valve_drake.valve.valve import PLATE, turned
 
 FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the valve's pose while none is known
 
@@ -149,14 +149,19 @@ class CollisionModel:
         return [f"{name(p.id_A)} - {name(p.id_B)}: {1e3 * p.distance:.0f} mm" for p in pairs]
 
     def at_handle(self, side: str, X_AG: np.ndarray) -> list[str]:
-        """What of the valve that turns an open hand at X_AG touches, by shape; wherever arm and valve are."""
+        """What of the valve that turns, or of a made panel's PLATE, an open hand at X_AG touches, by shape.
+
+        That is the same wherever arm and valve are.
+        """
         plant, inspector = self._plant, self._scene_graph.model_inspector()
-        wheel = plant.GetBodyByName("wheel", self._valve).index()
+        wheel, panel = (plant.GetBodyByName(name, self._valve).index() for name in ("wheel", "panel"))
         found = []
         for pair in self._near(compose(self._held[side], inverse(X_AG)), self._home):
             shapes = {plant.GetBodyFromFrameId(inspector.GetFrameId(s)).index(): s for s in (pair.id_A, pair.id_B)}
-            if wheel in shapes and self._hands[side] & shapes.keys():
-                found.append(inspector.GetName(shapes[wheel]).rpartition("::")[2])
+            for body in {wheel, panel} & shapes.keys() if self._hands[side] & shapes.keys() else ():
+                name = inspector.GetName(shapes[body]).rpartition("::")[2]
+                if body == wheel or name == PLATE:
+                    found.append(name)
         return sorted(set(found))
 
     def _near(

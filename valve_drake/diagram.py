@@ -178,6 +178,8 @@ def robot_of(scenario: Scenario) -> Robot:
         room = max(scenario.hybrid_rotation.grip_margin, d.collision.padding)
         least = width + 2 * room
         words = f"at least {least:g}: valve.handles.width and {room:g} to either side (collision.padding)"
+        if d.opening > 2 * room:
+            words += f", or the handles at most {d.opening - 2 * room:.4g} wide"
         require(d.opening >= least - 1e-9, "opening", words, d.opening)
     except ConfigError as error:
         raise ConfigError(f"{scenario.robot}: {error}") from error
@@ -290,12 +292,29 @@ def _head(scenario: Scenario) -> StereoHead:
     return load_head(named_files.find(scenario, "head_calibration"))
 
 
+def _check_seen(scenario: Scenario, head: StereoHead, robot: Robot) -> None:
+    """Raises ConfigError for a marker that is too small to be seen from the nearest place of a search."""
+    start, size = scenario.simulation.start, scenario.valve.marker.size
+    nearest = robot.stand[0]
+    if scenario.station == "simulated" and not start.at_valve:
+        nearest = start.distance.min if isinstance(start.distance, Uniform) else start.distance
+    least = scenario.color_segmentation.min_area
+    area = size[0] * size[1] * (head.left.focal() / nearest) ** 2
+    grow = math.sqrt(least / area)
+    words = (
+        f"at least [{grow * size[0]:.3f}, {grow * size[1]:.3f}]: {nearest:.3g} m away, the nearest place of a "
+        f"search, it has {area:.1f} px^2, and color_segmentation.min_area is {least:g}"
+    )
+    require(grow <= 1.0, "valve.marker.size", words, size)
+
+
 def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     """All blocks between the station's outputs and its inputs: the same objects for every station."""
     head = _head(scenario)
     valve, marker = scenario.valve, scenario.valve.target()
     X_LEyes = make(np.eye(3), head.X_LR[:, 3] / 2)  # between both head cameras: a near marker stays in both images
     robot = robot_of(scenario)
+    _check_seen(scenario, head, robot)
     servo: ImageServo | BlindServo
     if robot.description.servo == "camera":
         taught = load_taught(named_files.find(scenario, "taught"))

@@ -36,6 +36,7 @@ from valve_drake.robot.kinematics import Joints
 from valve_drake.robot.model import add_robot, parent_joint
 from valve_drake.robot.portrait import Studio, png
 from valve_drake.robot.robot import Robot
+from valve_drake.robot_postures import Postures, find_home, find_work
 from valve_drake.scenario import Scenario
 from valve_drake.stations.scene import add_scene, panel_pose
 from valve_drake.stations.servos import add_servos
@@ -45,6 +46,7 @@ from valve_drake.valve.valve import turned
 
 HEIGHTS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3)  # of the valve's axis [m]
 TILTS = (-0.3, 0.0, 0.3)  # of the panel; positive leans away at its top [rad]
+WORKED = (0.9, 1.1, 1.3)  # of those that a working posture is looked for at [m]
 TURN = math.pi / 2  # [rad]
 STEP, LIFT_STEP = 0.07, 0.15  # between two that are tried, and between two heights of a lift [m]
 ARC_STEP = 0.4  # of the turn [rad]
@@ -192,6 +194,8 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
     report.friction = _most(scenario.simulation.valve.friction)
     best = None if refused else _reach(report, robot, scenario, collision)  # no hand holds it: nothing to reach for
     _eyes(report, robot, scenario, best, pictures)
+    if not refused:
+        _postures(report, robot, scenario, collision)
     _rest(report, scenario)
     report.seconds = time.process_time() - start
     return report
@@ -495,7 +499,9 @@ def _in_the_way(report: Report, stances: Stances, collision: CollisionModel) -> 
         if margin >= stances.config.margin_min and found:
             pair = max(found, key=lambda links: found[links])
             text = f"links in the way are all that keeps it from {height:g} m, mostly {pair}"
-            report.add(MISSING, "reach", "collision", f"{text}: if they are neighbours, collision.srdf")
+            by_valve = set(pair.split(" - ")) & {"wheel", "panel"}
+            way = "smaller shapes of that link in the model" if by_valve else "if they are neighbours, collision.srdf"
+            report.add(MISSING, "reach", "collision", f"{text}: {way}")
             return
 
 
@@ -590,18 +596,37 @@ def _limits(plant: MultibodyPlant) -> dict[str, float]:
 
 def _eyes(report: Report, robot: Robot, scenario: Scenario, best: Best | None, pictures: bool) -> None:
     """What of the robot itself its eyes see, arms folded; and pictures of it."""
-    d = robot.description
+    head = _head_of(scenario)
+    report.hidden = _hidden(robot, scenario, head)
+    worst = max(report.hidden.values())
+    if worst > HIDDEN:
+        text = f"folded, the robot hides {100 * worst:.0f} % of the middle of an eye's image"
+        report.add(MISSING if worst > BLIND else DOUBTFUL, "search", "arms.*.home", text)
+    if pictures:
+        _pictures(report, robot, scenario, best, head, _eyes_of(head))
+
+
+def _head_of(scenario: Scenario) -> StereoHead | None:
     try:
-        head: StereoHead | None = _calibration(scenario)
+        return _calibration(scenario)
     except ConfigError:
-        head = None
-    eyes = {"left": np.eye(3, 4)} | ({} if head is None else {"right": head.X_LR})
+        return None
+
+
+def _eyes_of(head: StereoHead | None) -> dict[str, np.ndarray]:
+    """The poses of the eyes in the left one."""
+    return {"left": np.eye(3, 4)} | ({} if head is None else {"right": head.X_LR})
+
+
+def _hidden(robot: Robot, scenario: Scenario, head: StereoHead | None) -> dict[str, float]:
+    """By eye, how much of the middle of its image the robot hides with its arms at home, at the most."""
+    d, out = robot.description, {}
     arms = {side: arm.home for side, arm in robot.arms.items()}
     night = Studio(lambda plant: _alone(plant, robot), floor=False, sky=NIGHT)
     search = scenario.valve_search
     pitches = sorted({min(search.pitches), max(search.pitches)}) if d.gaze.tilt else [0.0]
     pans = (-ASIDE, 0.0, ASIDE) if d.gaze.pan else (0.0,)
-    for eye, X_LC in eyes.items():
+    for eye, X_LC in _eyes_of(head).items():
         info = _info(head, eye)
         shares = []
         for pitch in pitches:
@@ -609,13 +634,47 @@ def _eyes(report: Report, robot: Robot, scenario: Scenario, best: Best | None, p
                 night.pose(robot.named(torso=_gaze(robot, pitch, pan), arms=arms, opening=robot.opening))
                 image = night.view(compose(night.frame(d.cameras["head_left"]), X_LC), info)
                 shares.append(_share(image))
-        report.hidden[eye] = round(max(shares), 4)
-    worst = max(report.hidden.values())
-    if worst > HIDDEN:
-        text = f"folded, the robot hides {100 * worst:.0f} % of the middle of an eye's image"
-        report.add(MISSING if worst > BLIND else DOUBTFUL, "search", "arms.*.home", text)
-    if pictures:
-        _pictures(report, robot, scenario, best, head, eyes)
+        out[eye] = round(max(shares), 4)
+    return out
+
+
+def _postures(report: Report, robot: Robot, scenario: Scenario, collision: CollisionModel) -> None:
+    """Others to copy, where those of robot.yaml do not serve: work for a poor reach, home where it is in the way."""
+    spec = scenario.stance
+    work: Postures = {side: arm.work.tolist() for side, arm in robot.arms.items()}
+    most = max((row.margin for row in report.reach), default=1.0)
+    if most < spec.margin_good:
+        stances = _stances(robot, scenario, collision)
+        fixed = scenario.simulation.valve.height
+        heights = sorted({round((_least(fixed) + _most(fixed)) / 2, 2), *WORKED})
+        valves = {h: compose(panel_pose(ValveConfig(height=h)), inverse(scenario.valve.X_AP())) for h in heights}
+
+        def margin(other: Robot, X_BA: np.ndarray) -> float:
+            asked = dc.replace(stances, robot=other, is_free=CollisionModel(other).is_free)
+            return asked.best_arc(Turn(X_BA, TURN)).margin
+
+        if found := find_work(stances, valves, TURN, max(most, spec.margin_min), margin):
+            work = found.postures
+            text = f"with these, a valve at {found.height:g} m is turned with a margin of {found.margin:.2f}"
+            _tell(report, "work", work, text)
+    zero = not all(np.any(arm.home) for arm in robot.arms.values())
+    if not zero and max(report.hidden.values()) <= HIDDEN and not collision.touching(None, robot.home):
+        return
+    head = _head_of(scenario)
+
+    def serves(other: Robot) -> bool:
+        outer = {link: k for side in SIDES for link, k in _links(other, side).items()}
+        inside = any(_apart(outer.get(a, 0), outer.get(b, 0)) for a, b, _ in _overlaps(other))
+        free = not inside and not CollisionModel(other).touching(None, other.home)
+        return free and max(_hidden(other, scenario, head).values()) <= HIDDEN
+
+    if home := find_home(robot, collision, work, serves):
+        _tell(report, "home", home, "with these, the arms are free of all and out of the eyes' sight")
+
+
+def _tell(report: Report, key: str, postures: Postures, text: str) -> None:
+    for side in SIDES:
+        report.add(NOTE, "reach", f"arms.{side}.{key}", f"try {postures[side]}: {text}")
 
 
 def _share(image: np.ndarray) -> float:

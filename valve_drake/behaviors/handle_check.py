@@ -10,7 +10,7 @@ from valve_drake.behaviors.grasp_geometry import APART
 from valve_drake.checks import ConfigError, require
 from valve_drake.frames import make
 from valve_drake.messages import SIDES
-from valve_drake.valve.valve import Valve
+from valve_drake.valve.valve import PLATE, Valve
 
 ROOM = 0.3  # so much farther from the axis a hand is looked for that is clear of the valve, for the error's line [m]
 
@@ -30,12 +30,19 @@ def check_handles(at_handle: AtHandle, valve: Valve) -> None:
     handle, side = next((k, side) for side in SIDES for k in count if k not in free[side])
     way = min(_ways(valve, handle), key=lambda X: len(at_handle(side, X)))
     touched = set(at_handle(side, way))
+    if touched == {PLATE}:
+        extra = _room(at_handle, side, way, touched, np.array([0.0, 0.0, -1.0]))
+        least = math.ceil(1e3 * (valve.panel.depth + (extra or 0.0))) / 1e3
+        rule = f"at least {least:g}: an open hand at valve.handles[{handle}] touches the panel"
+        require(False, "valve.panel.depth", f"{rule} or is nearer than collision.padding", valve.panel.depth)
     words = f"an open hand there touches the valve ({', '.join(sorted(touched))}) or is nearer than collision.padding"
-    fixed = {name for name in touched if not name.startswith("spoke")}  # spokes reach as far as the rim, wherever it is
+    fixed = {
+        name for name in touched if not name.startswith("spoke") and name != PLATE
+    }  # spokes reach as far as the rim, wherever it is
     if not fixed:
         rule = f"fewer, or farther from valve.handles[{handle}]: {words}"
         raise ConfigError(f"valve.spokes must be {rule}, got {valve.spokes}")
-    extra = _room(at_handle, side, way, fixed)
+    extra = _room(at_handle, side, way, fixed, np.array([*way[:2, 3], 0.0]) / math.hypot(*way[:2, 3]))
     least = math.ceil(1e3 * (math.hypot(*valve.radius(handle)) + (extra or 0.0))) / 1e3
     rule = "where a hand fits" if extra is None else f"at least {least:g} m off the axis"
     require(False, f"valve.handles[{handle}].xyz", f"{rule}: {words}", valve.handles[handle].xyz)
@@ -46,12 +53,12 @@ def _ways(valve: Valve, handle: int) -> list[np.ndarray]:
     return [valve.grasp(handle, sign) for sign in (1.0, -1.0)]
 
 
-def _room(at_handle: AtHandle, side: str, X_AG: np.ndarray, touched: set[str]) -> float | None:
-    """How much farther from the axis a hand is clear of these shapes, with the valve as it is [m]; None: nowhere."""
-    outwards = np.array([*X_AG[:2, 3], 0.0]) / math.hypot(*X_AG[:2, 3])
+def _room(at_handle: AtHandle, side: str, X_AG: np.ndarray, touched: set[str], direction: np.ndarray) -> float | None:
+    """How much farther along a direction of A (3,) a hand is clear of these shapes, with the valve as it is [m]; None:
+    nowhere."""
 
     def touches(extra: float) -> bool:
-        there = make(X_AG[:, :3], X_AG[:, 3] + extra * outwards)
+        there = make(X_AG[:, :3], X_AG[:, 3] + extra * direction)
         return not touched.isdisjoint(at_handle(side, there))
 
     low, high = 0.0, ROOM

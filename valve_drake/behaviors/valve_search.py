@@ -12,8 +12,9 @@ Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base w
              does, since a valve that such a robot can reach is near (`bolted`).
     others   The neck keeps the last known p_OV on the optical axis of the left camera, the waist comes back to zero;
              only while driving it helps when the neck is at its end.
-             Without a sighting for `lost_after` while driving or measuring: failed with marker_lost. While the hands go
-             to the handles, two estimates that agree on another place than the one measured: failed with cause moved.
+             Without a sighting for `lost_after` while driving or measuring: failed with marker_lost; while it drives
+             across, so that neck and waist do not turn as far as the marker, that does not count. While the hands go to
+             the handles, two estimates that agree on another place than the one measured: failed with cause moved.
 
 Sightings carry the camera's pose X_OL of their capture time: p_OV = X_OL p_LV holds in motion too. Frames: frames.py.
 """
@@ -158,6 +159,7 @@ class Memory:
     target: np.ndarray | None = None  # p_OV [m]
     aside: np.ndarray | None = None  # where it looks, off the target, in O [m]; None: at it
     target_time: float = -np.inf  # its capture time [s]
+    averted: float = -np.inf  # when the gaze last did not reach it while driving [s]
     capture_time: float = -np.inf  # of the newest sighting looked at [s]
     estimate_time: float = -np.inf  # capture time of the newest pose of the marker [s]
     estimated: np.ndarray | None = None  # p_OV by it [m]
@@ -237,7 +239,9 @@ def step(
         m = _sight(config, m, position, estimate)
         m = _place(config, m, estimate, mode.mode in FIXED and m.result == "running")
         if mode.mode in WATCHED and m.result == "running":
-            blind = time - max(m.since, m.target_time)
+            if mode.mode in DRIVING and _out_of_reach(config, m, base, robot_state.torso, head_pose):
+                m = changed(m, averted=time)
+            blind = time - max(m.since, m.target_time, m.averted)
             if blind > config.lost_after:
                 m = _end(m, "failed", Verdict.MARKER_LOST, f"marker not seen for {blind:.1f} s")
         waist = float(robot_state.torso[0])
@@ -369,6 +373,16 @@ def _gaze(
     beyond = waist + yaw - _within(waist + yaw, -config.sweep_yaw, config.sweep_yaw)
     twist = _within(beyond, -config.sweep_waist, config.sweep_waist) if driving else 0.0
     return np.array([twist, *_neck(config, pitch, yaw)])
+
+
+def _out_of_reach(
+    config: ValveSearchConfig, m: Memory, base: np.ndarray, torso: np.ndarray, head_pose: HeadPose
+) -> bool:
+    """Whether neck and waist together do not turn as far as the marker."""
+    if m.target is None:
+        return False
+    _, yaw = aim(head_pose, base, torso, m.target)
+    return abs(wrap(float(torso[0]) + yaw)) > config.yaw_limit + config.sweep_waist + VIEW
 
 
 def _neck(config: ValveSearchConfig, pitch: float, yaw: float) -> tuple[float, float]:

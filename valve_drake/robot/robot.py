@@ -302,6 +302,11 @@ class Robot:
         n = len(self.arms[LEFT])
         return {LEFT: q[:n], RIGHT: q[n:]}
 
+    def shoulder(self, side: str) -> np.ndarray:
+        """Where an arm's first joint is, in the base, all at home -> (3,) [m]."""
+        self._plant.SetPositions(self._context, self._home_q)
+        return self._pose(self._chains[side].shoulder)[:, 3]
+
     def forward(self, side: str, q: np.ndarray, posture: np.ndarray | None = None) -> np.ndarray:
         """X_BG of a hand for its arm's joints (n,) -> (3, 4). posture: lift and waist; None or empty: at home."""
         chain = self._chains[side]
@@ -495,8 +500,7 @@ class Robot:
         require(bool(off.max() < _ON_WAY), "base.frame", words, self.description.base.frame)
 
     def _check_sides(self) -> None:
-        self._plant.SetPositions(self._context, self._home_q)
-        left, right = (self._pose(self._chains[side].shoulder)[1, 3] for side in SIDES)
+        left, right = (self.shoulder(side)[1] for side in SIDES)
         if left <= right:
             raise ConfigError(
                 f"arms.left must be to the left of arms.right, got shoulders at y = {left:.3g} and {right:.3g} m"

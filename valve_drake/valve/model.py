@@ -26,7 +26,7 @@ from valve_drake.checks import ConfigError, require
 from valve_drake.frames import compose, inverse, make, rot_z
 from valve_drake.robot.description import find_package_file
 from valve_drake.robot.model import frame_named, joint_named, parent_joint, parse
-from valve_drake.valve.valve import Valve
+from valve_drake.valve.valve import PLATE, SPOKE, Valve
 
 RED, GREEN = (0.80, 0.06, 0.05, 1.0), (0.05, 0.55, 0.15, 1.0)
 STEEL, DARK = (0.70, 0.71, 0.73, 1.0), (0.08, 0.085, 0.095, 1.0)
@@ -158,7 +158,7 @@ def _made(plant: MultibodyPlant, valve: Valve) -> ModelInstanceIndex:
     plant.AddJointActuator("stem", stem, TORQUE)
     p, m = valve.panel, valve.marker
     plate = RigidTransform([0, 0, 0.01])
-    _solid(plant, panel, plate, Box(p.width, p.height, 0.02), "plate", ENAMEL)
+    _solid(plant, panel, plate, Box(p.width, p.height, 0.02), PLATE, ENAMEL)
     X_PA = inverse(valve.X_AP())
     # the hub, from the panel to the grip plane, and the post that carries the marker's face
     _solid(plant, wheel, RigidTransform([0, 0, -p.depth / 2 - 0.005]), Cylinder(HUB, p.depth - 0.01), "hub", DARK)
@@ -226,7 +226,7 @@ def _rim(plant: MultibodyPlant, wheel: RigidBody, X_PA: np.ndarray, valve: Valve
     for k in range(valve.spokes):
         direction = rot_z(between + 2 * math.pi * k / valve.spokes)[:, 0]
         end = direction * radius + [0, 0, z]
-        _beam(plant, wheel, X_PA, np.array([0.0, 0.0, z]), end, 0.016, f"spoke_{k + 1}", DARK, solid=True)
+        _beam(plant, wheel, X_PA, np.array([0.0, 0.0, z]), end, SPOKE, f"spoke_{k + 1}", DARK, solid=True)
 
 
 def _thick(width: float, mark_height: float) -> float:

@@ -27,6 +27,8 @@ LOOK = 0.12  # from such a marker's middle towards the axis, where the head look
 ALIKE = 0.02  # handles that differ by less look the same to the head's cameras [m]
 SAME_RIM = 0.005  # by which places on one rim may differ; a hand's fingers make up for as much [m]
 LOWEST_MARK = 0.003  # of a green mark over the middle of a handle that is made of the keys [m]
+PLATE = "plate"  # the shape of a made panel: across the axis, so it is the same however the valve is turned
+SPOKE = 0.016  # width and thickness of a made rim's spokes [m]
 _UPRIGHT = 0.35  # horizontal part of an axis' direction below which it has no heading of its own
 
 
@@ -51,6 +53,11 @@ class HandleConfig(Config):
         if self.along:
             across = len(self.along) == 3 and math.hypot(*self.along[:2]) > 0.9 * math.hypot(*self.along) > 0
             require(across, f"{key}.along", "a direction across the axis, three numbers", self.along)
+
+        x, y, _ = self.direction()
+        if abs(self.xyz[0] * y - self.xyz[1] * x) < 0.02 * radius:  # it points at the axis
+            words = f"at most {2 * radius:g}: it reaches beyond the axis"
+            require(self.length <= 2 * radius + 1e-9, f"{key}.length", words, self.length)
 
     def direction(self) -> np.ndarray:
         """Unit vector along the handle, across the axis, in A -> (3,)."""
@@ -137,6 +144,10 @@ class Valve(Config):
         handles = self.handles
         require(2 <= len(handles) <= 12, f"{key}.handles", "2 to 12 places, one for each hand", len(handles))
         require(len(self.obstacles) <= 20, f"{key}.obstacles", "at most 20 boxes", len(self.obstacles))
+        for k, handle in enumerate(handles):
+            for i, other in enumerate(handles[:k]):
+                words = f"a place of its own, {ALIKE:g} m or more from {key}.handles[{i}]"
+                require(math.dist(handle.xyz, other.xyz) >= ALIKE - 1e-9, f"{key}.handles[{k}].xyz", words, handle.xyz)
         apart = max(math.dist(a.xyz[:2], b.xyz[:2]) for a in handles for b in handles)
         words = "two of them at least 0.12 m apart across the axis, for two hands"
         require(apart >= 0.12, f"{key}.handles", words, f"{apart:.3g} m")
@@ -154,6 +165,9 @@ class Valve(Config):
             words = f"at least {LOWEST_MARK:g} on handles that are made of these keys: the marks lie on them"
             high = self.marker.mark_height
             require(high >= LOWEST_MARK, f"{key}.marker.mark_height", words, high)
+            front = self._front()
+            words = f"before the valve's bars and spokes, z at most {front:.4g}: they hide it"
+            require(self.fixed or self.marker.xyz[2] <= front + 1e-9, f"{key}.marker.xyz", words, self.marker.xyz)
         if self.fixed:
             off = math.hypot(*self.marker.xyz[:2])
             inner = math.ceil(1e3 * (self._outermost() + math.hypot(*self.marker.size) / 2)) / 1e3
@@ -167,6 +181,22 @@ class Valve(Config):
     def _outermost(self) -> float:
         """How far from the axis the handles reach [m]."""
         return max(math.hypot(*h.xyz[:2]) + (h.width if h.kind == "rim" else h.length) / 2 for h in self.handles)
+
+    def _front(self) -> float:
+        """The front of what a valve made of these keys has before its marker, z of A; infinite: nothing [m]."""
+        centre, half = np.array(self.marker.xyz[:2]), np.array(self.marker.size) / 2
+        R = rot_z(self.marker.rpy[2])[:2, :2]
+        fronts = [math.inf]
+        for handle in self.handles:
+            if handle.kind == "rim":
+                inside = math.hypot(*centre) < math.hypot(*handle.xyz[:2])
+                fronts += [handle.xyz[2] - SPOKE / 2] if self.spokes and inside else []
+                continue
+            way = np.linspace(0.0, 1.0, 50)[:, None] * np.array(handle.xyz[:2])
+            off = np.abs((way - centre) @ R)
+            if np.any(np.all(off < half + handle.width / 2, axis=1)):
+                fronts.append(handle.xyz[2] - handle.width / 2)
+        return min(fronts)
 
     @property
     def fixed(self) -> bool:
