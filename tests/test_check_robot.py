@@ -204,9 +204,9 @@ REAL = {
             (MISSING, "search gaze.tilt: no joint turns the eyes up and down"),
             (NOTE, "approach base.drive: fixed"),
             (DOUBTFUL, "grasp opening: the fingers open by 42 mm"),
-            (MISSING, "reach arms.*.work: no valve is turned by a quarter"),
+            (MISSING, "grasp : opening must be wider, or frames."),
         ],
-        {0.5: False, 1.2: False},
+        {},
     ),
     "vega_1": (
         VEGA,

@@ -2,15 +2,18 @@
 
 import dataclasses as dc
 import re
+import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+from robot_variants import part, variant
 
 from valve_drake import scenario as scenarios
 from valve_drake.behaviors.handle_check import check_handles
 from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.diagram import make_blocks
+from valve_drake.messages import SIDES
 from valve_drake.robot import description
 from valve_drake.robot.robot import Robot
 from valve_drake.valve.valve import HandleConfig, MarkerConfig, PanelConfig, Valve
@@ -19,7 +22,8 @@ VALVE = Valve()
 
 
 def check(valve: Valve) -> None:
-    check_handles(CollisionModel(Robot.load(description.find("robot/robot.yaml"), valve)).at_handle, valve)
+    robot = Robot.load(description.find("robot/robot.yaml"), valve)
+    check_handles(CollisionModel(robot), valve, robot.opening)
 
 
 def made(radius: float, kind: str = "bar", count: int = 2, **changes) -> Valve:
@@ -66,6 +70,21 @@ def test_a_panel_that_hands_touch_is_refused_with_the_least_depth_which_will_do(
     check(near(float(said[1])))
     with pytest.raises(ConfigError, match="valve.panel.depth must be at least"):
         check(near(float(said[1]) - 0.003))
+
+
+def test_fingers_that_do_not_go_round_a_handle_are_the_robots_fault(tmp_path):
+    """A hand has a shape where it is to hold: no other place of the handle would help."""
+    knob = ElementTree.fromstring("""<collision name="knob"><pose>0 0 0.14 0 0 0</pose><geometry><sphere>
+        <radius>0.01</radius></sphere></geometry></collision>""")
+    path = variant(tmp_path, lambda model: [part(model, "link", f"{side}_hand").append(knob) for side in SIDES])
+    robot = Robot.load(path, VALVE)
+    with pytest.raises(ConfigError) as error:
+        check_handles(CollisionModel(robot), VALVE, robot.opening)
+    assert str(error.value) == (
+        "opening must be wider, or frames.left_grip and pad.at between the fingers' shapes: an open hand at "
+        "valve.handles[0], 0.025 m wide, touches what it is to hold (bar) or is nearer than collision.padding, "
+        "got 0.085"
+    )
 
 
 def test_two_hands_need_two_handles_that_they_can_be_at():

@@ -164,6 +164,15 @@ class CollisionModel:
                     found.append(name)
         return sorted(set(found))
 
+    def held_at(self, side: str, X_AG: np.ndarray) -> list[str]:
+        """What of the valve that turns is where a hand at X_AG grips, by shape."""
+        inspector = self._scene_graph.model_inspector()
+        wheel = self._plant.GetBodyByName("wheel", self._valve)
+        query = self._pose(compose(self._held[side], inverse(X_AG)), self._home, None)
+        inside = query.ComputeSignedDistanceToPoint(self._held[side][:, 3], 0.0)
+        own = set(self._plant.GetCollisionGeometriesForBody(wheel))
+        return sorted({inspector.GetName(at.id_G).rpartition("::")[2] for at in inside if at.id_G in own})
+
     def _near(
         self, X_BA: np.ndarray | None, q: np.ndarray, posture: np.ndarray | None = None
     ) -> list[SignedDistancePair]:

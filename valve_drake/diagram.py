@@ -327,7 +327,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     collision = CollisionModel(robot)
     if touching := collision.touching(None, robot.home):
         raise ConfigError(f"{scenario.robot}: arms.left.home and arms.right.home must be free of all: {touching[0]}")
-    check_handles(collision.at_handle, valve)
+    check_handles(collision, valve, robot.opening)
     stances = Stances(robot, valve, scenario.stance, view, collision.is_free, collision.pairs, robot.drive.fixed)
     return [
         RobotStateSystem(robot.groups),

@@ -184,7 +184,7 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
     _home(report, robot, collision)
     refused = ""
     try:
-        check_handles(collision.at_handle, scenario.valve)
+        check_handles(collision, scenario.valve, robot.opening)
     except ConfigError as error:
         refused = str(error)
         report.add(MISSING, "grasp", "", refused)

@@ -2,7 +2,8 @@
 
 import itertools
 import math
-from typing import Protocol
+from collections.abc import Callable
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -15,14 +16,23 @@ from valve_drake.valve.valve import PLATE, Valve
 ROOM = 0.3  # so much farther from the axis a hand is looked for that is clear of the valve, for the error's line [m]
 
 
-class AtHandle(Protocol):
-    """What of the valve that turns an open hand touches (CollisionModel.at_handle)."""
-
-    def __call__(self, side: str, X_AG: np.ndarray) -> list[str]: ...
+AtHandle: TypeAlias = Callable[[str, np.ndarray], list[str]]  # side, X_AG -> shapes
 
 
-def check_handles(at_handle: AtHandle, valve: Valve) -> None:
-    """Raises ConfigError if there are no two handles that open hands can be at: they touch the valve at the others."""
+class Hands(Protocol):
+    """What of the valve is at open hands (CollisionModel)."""
+
+    def at_handle(self, side: str, X_AG: np.ndarray) -> list[str]: ...
+
+    def held_at(self, side: str, X_AG: np.ndarray) -> list[str]: ...
+
+
+def check_handles(hands: Hands, valve: Valve, opening: float) -> None:
+    """Raises ConfigError if there are no two handles that open hands can be at: they touch the valve at the others.
+
+    opening: of the hands [m].
+    """
+    at_handle = hands.at_handle
     count = range(len(valve.handles))
     free = {side: [k for k in count if any(not at_handle(side, X) for X in _ways(valve, k))] for side in SIDES}
     if any(math.dist(valve.radius(i), valve.radius(k)) >= APART for i, k in itertools.product(*free.values())):
@@ -30,6 +40,12 @@ def check_handles(at_handle: AtHandle, valve: Valve) -> None:
     handle, side = next((k, side) for side in SIDES for k in count if k not in free[side])
     way = min(_ways(valve, handle), key=lambda X: len(at_handle(side, X)))
     touched = set(at_handle(side, way))
+    if held := touched.intersection(hands.held_at(side, way)):
+        rule = (
+            f"wider, or frames.{side}_grip and pad.at between the fingers' shapes: an open hand at "
+            f"valve.handles[{handle}], {valve.handles[handle].width:g} m wide, touches what it is to hold"
+        )
+        require(False, "opening", f"{rule} ({', '.join(sorted(held))}) or is nearer than collision.padding", opening)
     if touched == {PLATE}:
         extra = _room(at_handle, side, way, touched, np.array([0.0, 0.0, -1.0]))
         least = math.ceil(1e3 * (valve.panel.depth + (extra or 0.0))) / 1e3
@@ -54,8 +70,7 @@ def _ways(valve: Valve, handle: int) -> list[np.ndarray]:
 
 
 def _room(at_handle: AtHandle, side: str, X_AG: np.ndarray, touched: set[str], direction: np.ndarray) -> float | None:
-    """How much farther along a direction of A (3,) a hand is clear of these shapes, with the valve as it is [m]; None:
-    nowhere."""
+    """How much farther along a direction of A (3,) a hand is clear of these shapes [m]; None: nowhere."""
 
     def touches(extra: float) -> bool:
         there = make(X_AG[:, :3], X_AG[:, 3] + extra * direction)
