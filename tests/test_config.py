@@ -21,10 +21,9 @@ from valve_drake.behaviors.stance_search import Stances
 from valve_drake.checks import ConfigError
 from valve_drake.config import Config, Number, Uniform, number, numbers, plain, table
 from valve_drake.frames import make, rot_x, rot_y
-from valve_drake.messages import SIDES
+from valve_drake.messages import DEVICES, SIDES
 from valve_drake.scenario import Scenario
 from valve_drake.stations.faults import FaultConfig
-from valve_drake.stations.lcm_channels import DEVICES
 from valve_drake.valve.valve import Valve
 
 LEAVES = {leaf.key: leaf for leaf in config.leaves(Scenario())}

@@ -13,7 +13,7 @@ from robot_facts import GROUPS
 from valve_drake import diagram, drawing, resources
 from valve_drake import scenario as scenarios
 from valve_drake.checks import ConfigError, OperationFailed
-from valve_drake.messages import CAMERAS, CameraFrame
+from valve_drake.messages import CAMERAS, DEVICES, CameraFrame
 from valve_drake.ports import SLOT, TICK
 from valve_drake.stations import hardware, lcm_channels
 from valve_drake.stations.bus import Bus
@@ -24,7 +24,6 @@ from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
     CONTROLLER,
-    DEVICES,
     REPORTS,
     REQUEST,
     ROBOT,
@@ -92,7 +91,7 @@ class Puppet:
         return shown
 
     def age(self, shown, device):
-        return shown.health.ages[DEVICES.index(device)]
+        return shown.health.ages[shown.health.devices.index(device)]
 
 
 @pytest.fixture
@@ -120,6 +119,10 @@ def test_the_table_carries_every_vector_port_of_the_contract_and_every_camera():
     carried = [port for row in REPORTS + COMMANDS for port in row.read(row.encode(0, said))]
     assert sorted(carried) == sorted(OUT | IN)
     assert {f"{camera}.image" for camera in CAMERAS} <= set(CHANNELS)
+
+
+def test_every_device_that_can_be_silent_has_its_row_in_the_table():
+    assert {row.device for row in REPORTS} | {*CAMERAS, "robot"} == set(DEVICES)
 
 
 def test_the_table_in_the_documents_is_current():

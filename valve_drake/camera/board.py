@@ -13,6 +13,7 @@ import numpy as np
 
 from valve_drake.checks import ConfigError, require, shown
 
+# Of the sub-pixel search: the most steps, and a step that is small enough [px].
 _DONE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
 _QUICK = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 # The sector-based search finds boards whose outer squares are cut off, or with things in front of their rim.
@@ -22,7 +23,7 @@ _THOROUGH = (cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_C
 # cannot be interrupted.
 _SEARCHED = (1300, 2000)
 _TILE = 1300  # side of the overlapping parts in which a larger image is searched last [px]
-_OVERLAP = 400
+_OVERLAP = 400  # of such parts; raise it for boards that are larger in the image and lie across two [px]
 _MIN_PAIRS = 3  # pairs by names, if other images have no partner; fewer names may agree by chance
 _WINDOW = 24  # largest half window of the sub-pixel search [px]
 

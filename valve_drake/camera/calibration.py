@@ -34,7 +34,7 @@ from valve_drake.least_squares import minimize
 
 KINDS = ("opencv", "paper")
 RANGES = (0.5, 1.0, 2.0)  # at which points are triangulated [m]
-MIN_VIEWS = 3
+MIN_VIEWS = 3  # of boards in any pose: fewer do not determine a lens
 _MAX_FOCAL_SIGMA = 0.02  # relative standard deviation of a focal length that is accepted; raise it for coarse work
 _MIN_TILT = 8.0  # some board must be tilted by this against the camera's axis, and by this against another [deg]
 _TILT = "tilt it by up to 45 deg to all sides, or give --distances"

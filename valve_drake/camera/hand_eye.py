@@ -38,7 +38,7 @@ METHODS = {
     "Andreff": cv2.CALIB_HAND_EYE_ANDREFF,
     "Daniilidis": cv2.CALIB_HAND_EYE_DANIILIDIS,
 }
-MIN_VIEWS = 3
+MIN_VIEWS = 3  # two turns about different axes
 STANDS_OUT = 5.0  # a view farther off is a blunder; raise it if good views are left out [standard deviations]
 _MAX_BLUNDERS = 0.25  # share of the views that may be left out
 _MIN_PX = 1e-3  # least noise of the corners that is assumed, since drawn corners are exact [px]

@@ -31,7 +31,7 @@ _BETTER = 4.0  # a mistake explains the disagreement if undoing it makes it smal
 _FINE_DEG, _FINE_MM = 1.0, 10.0  # views that disagree by less are not suspected
 _REACH = 5.0  # positions farther apart are taken for millimetres [m]
 _FEWEST = 4  # least number of views with which mistakes are tried
-_SHIFTS = (1, -1, 2, -2, 3, -3)
+_SHIFTS = (1, -1, 2, -2, 3, -3)  # by so many images the poses may be shifted
 
 
 @dc.dataclass(frozen=True)

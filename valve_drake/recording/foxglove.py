@@ -39,7 +39,7 @@ from valve_drake.messages import (
 from valve_drake.recording.refilled import STAMP, Refilled, slot
 from valve_drake.recording.schemas import Encoded
 
-NANO = 1_000_000_000
+NANO = 1_000_000_000  # [ns/s]
 AUDIO = "/operator/audio"  # its topic
 ACCEPTED = Color(r=0.0, g=0.9, b=1.0, a=1.0)
 REJECTED = Color(r=1.0, g=0.6, b=0.0, a=1.0)

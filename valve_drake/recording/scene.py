@@ -14,7 +14,7 @@ from pydrake.geometry import Box, Cylinder, Mesh, ReadObjToTriangleSurfaceMesh, 
 from valve_drake.checks import ConfigError
 from valve_drake.recording.foxglove import pose, stamp
 
-GREY = (0.7, 0.7, 0.7, 1.0)
+GREY = (0.7, 0.7, 0.7, 1.0)  # of what has no colour, RGBA
 
 Part = tuple[str, Shape, np.ndarray, Iterable[float]]
 """One piece: the frame that carries it, its shape, its pose X (3, 4) in the frame, its colour (r, g, b, a) in 0..1."""

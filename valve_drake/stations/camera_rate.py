@@ -15,8 +15,8 @@ from valve_drake.stations.simulation_config import CameraConfig
 
 SECOND = 1.0  # between two judgements [s, wall]
 BEHIND = 0.03  # share of a second that may be lost; raise it for a machine whose clock stutters
-ROOM = 4  # seconds without loss before the cameras are faster again; doubled whenever that was too early
-MOST_ROOM = 64
+# Seconds without loss before the cameras are faster again; doubled whenever that was too early, up to the other.
+ROOM, MOST_ROOM = 4, 64
 HOPELESS = 0.5  # share of a second that was lost: no program can work with that, and it is told why
 
 

@@ -118,7 +118,7 @@ def lights(config: LightConfig) -> list[LightParameter]:
 
 RENDERER = "cameras"  # its name in the rig's SceneGraph
 DARK = 0.02  # of an image's brightness, where the lamps are out
-BACKGROUND = (0.80, 0.85, 0.90)
+BACKGROUND = (0.80, 0.85, 0.90)  # where nothing is, RGB
 # Up to which distance the edges of the valve's visuals are measured, by name [m]: the marker's always, those of the
 # handles' marks by the wrist cameras alone (of the head cameras' images, from farther off, only their middles count).
 FINE_WITHIN = {"marker": math.inf, **{f"mark_{k}": 0.5 for k in range(1, 13)}}

@@ -31,7 +31,7 @@ from valve_drake.stations import render_egl
 from valve_drake.stations.camera_rig import CameraRig, Capture, decoded
 from valve_drake.stations.contract import MATE
 
-WORKERS = 2
+WORKERS = 2  # one for each eye of a pair, see `_worker`
 NICENESS = 5  # of the processes: the run goes first where processors are few. 0 where a late image does more harm
 KEPT = 8  # captures of a camera that may still be asked for
 

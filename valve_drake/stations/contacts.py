@@ -18,7 +18,7 @@ from valve_drake.robot.robot import Robot
 
 EVERY = 8  # ticks between two looks, 1/16 s: a touch may be shorter, but twice as many cost 1 % of a run
 MOST = 8  # pairs of bodies that are named at a time, the hardest ones; raise it if a robot falls into a heap
-SIZE = 7 + 3 * MOST
+SIZE = 7 + 3 * MOST  # of what `ContactReader.look` gives
 NOTHING = np.zeros(SIZE)
 NONE = Contacts()
 

@@ -27,11 +27,11 @@ import numpy as np
 
 from valve_drake.checks import require
 from valve_drake.config import Config, choice, number
-from valve_drake.messages import Mode
+from valve_drake.messages import DEVICES, Mode
 from valve_drake.ports import TICK
 from valve_drake.robot.description import MOST_JOINTS
 from valve_drake.robot.groups import GROUPS
-from valve_drake.stations.lcm_channels import CHANNELS, DEVICES
+from valve_drake.stations.lcm_channels import CHANNELS
 
 WIRE = ("latency", "loss", "duplicate", "reorder")
 DEVICE = ("frozen", "nan", "dead", "restart", "stuck", "estop")

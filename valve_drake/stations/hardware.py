@@ -44,7 +44,6 @@ from valve_drake.stations.lcm_channels import (
     CHANNELS,
     COMMANDS,
     CONTROLLER,
-    DEVICES,
     IMAGES,
     LOCKSTEP_TIME,
     MODE,
@@ -166,7 +165,7 @@ class RobotLink:
         for side in SIDES:
             if f"{side}_wrist_sensor" in groups.absent:
                 self._forces[f"{side}_arm.status"] = f"{side}_arm.torque_measured"
-        self._devices = tuple(device for device in DEVICES if device not in groups.absent)
+        self._devices = (*(row.device for row in self._said), *IMAGES, "robot")  # in the order of `_diagnose`
         self.stop = stop
         self._config = bus.config
         self._idle = idle or (lambda: wall.sleep(2e-4))

@@ -309,7 +309,6 @@ CHANNELS: dict[str, Channel] = {row.key: row for row in _rows()}
 COMMANDS = tuple(row for row in CHANNELS.values() if row.sender == CONTROLLER and row.write)
 REPORTS = tuple(row for row in CHANNELS.values() if row.sender == ROBOT and row.write)
 IMAGES = {camera: CHANNELS[f"{camera}.image"] for camera in CAMERAS}
-DEVICES = (*(row.device for row in REPORTS), *CAMERAS, "robot")
 
 
 def present(rows: Iterable[Channel], groups: Groups) -> tuple[Channel, ...]:

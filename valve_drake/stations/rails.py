@@ -38,7 +38,7 @@ BEGUN = 1e-3  # [m]
 CREEP = 0.004  # a body moves so far while it stays [m]
 THERE = 1e-5  # so near to a place a rail is there [m]
 BEFORE = 0.015  # the cover is so far before the marker [m]
-CLOTH = (0.45, 0.42, 0.36, 1.0)
+CLOTH = (0.45, 0.42, 0.36, 1.0)  # of the cover, RGBA
 
 
 @dc.dataclass(frozen=True)
