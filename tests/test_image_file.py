@@ -104,6 +104,16 @@ def test_no_more_is_decoded_than_the_header_may_claim(kind, tmp_path, monkeypatc
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", [b"IDAT", b"zzzz"])
+def test_a_png_whose_chunk_claims_to_be_longer_than_the_file_is_not_decoded(name, monkeypatch):
+    data = cv2.imencode(".png", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
+    at = data.index(b"IDAT") - 4
+    claims = data[:at] + (2**31 - 1).to_bytes(4, "big") + name + data[at + 8 :]
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    with pytest.raises(ConfigError, match="^image x: a damaged PNG image$"):
+        image_file.decode(claims, "image x")
+
+
 def test_a_file_that_is_no_photograph_is_one_line(tmp_path):
     (tmp_path / "text.png").write_text("no image")
     (tmp_path / "empty.png").write_bytes(b"")

@@ -42,6 +42,8 @@ def decode(data: bytes, key: str, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
     if width < 1 or height < 1 or width * height > MAX_PIXELS or width * height * pixel_bytes > _MAX_DECODED:
         most = f"at most {MAX_PIXELS / 1e6:.0f} megapixels and {_MAX_DECODED / 1e6:.0f} MB decoded are read"
         raise ConfigError(f"{key}: {width} x {height} pixels of {pixel_bytes} bytes: {most}")
+    if kind == "PNG" and not _png_is_whole(data):
+        raise ConfigError(f"{key}: a damaged PNG image")
     if kind == "JPEG" and data.count(b"\xff\xda") > _MAX_SCANS:
         raise ConfigError(f"{key}: a JPEG of more than {_MAX_SCANS} scans")
     with _decoder_messages() as messages:
@@ -141,6 +143,16 @@ def _png(data: bytes) -> tuple[int, int, int]:
     channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(_number(data, 25, 1), 4)
     depth = 2 if _number(data, 24, 1) == 16 else 1
     return _number(data, 16, 4, "big"), _number(data, 20, 4, "big"), channels * depth
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Whether its chunks follow each other to its end: a decoder allocates what a chunk claims to be long."""
+    at = 8
+    while at + 12 <= len(data):
+        at, kind = at + 12 + _number(data, at, 4, "big"), data[at + 4 : at + 8]
+        if kind == b"IEND":
+            return at <= len(data)
+    return False
 
 
 def _jpeg(data: bytes) -> tuple[int, int, int] | None:
