@@ -9,7 +9,7 @@ import pytest
 
 from valve_drake import frames
 from valve_drake.analysis import hand_eye_experiment as experiment
-from valve_drake.camera import hand_eye, hand_eye_report
+from valve_drake.camera import hand_eye, hand_eye_mistakes, hand_eye_report
 from valve_drake.camera.board import Board
 from valve_drake.camera.calibration_file import save_camera
 from valve_drake.camera.calibration_report import Pictures
@@ -140,6 +140,21 @@ def test_a_blunder_is_left_out_and_named():
     result = hand_eye.hand_eye(PAPER, BOARD.points(), [board_seen(X, 0.2, rng) for X in true], given)
     assert set(range(10)) - set(result.used) == {3} and result.off[3] > hand_eye.STANDS_OUT
     assert np.abs((result.X[:, 3] - X_EC[:, 3]) * 1e3 / result.sigma_mm).max() < 4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_poses_of_no_arm_at_all_are_refused_in_one_line(seed):
+    rng = np.random.default_rng(seed)
+    corners = [board_seen(X) for X in hand_poses(6)]
+    far = [frames.make(frames.rotation(rng.normal(0, 2, 3)), rng.normal(0, 1000, 3)) for _ in corners]
+    seen = hand_eye.observe(PAPER, BOARD.points(), corners, far)
+    with pytest.raises(ConfigError, match="^hand-eye: ") as error:
+        hand_eye_mistakes.refuse_scatter(hand_eye.from_seen(seen, PAPER, BOARD.points(), corners), seen, poses_of(far))
+    assert "\n" not in str(error.value)
+
+
+def poses_of(X_BE):
+    return hand_eye_mistakes.Poses(tuple(f"{k}.png" for k in range(len(X_BE))), np.array(X_BE), tuple(range(len(X_BE))))
 
 
 def test_a_hand_that_turned_about_one_axis_is_refused():

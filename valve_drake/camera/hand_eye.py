@@ -16,10 +16,11 @@ X = X_EC, Y = X_BT. Beside the robot (the hand holds the board): X = X_BC, Y = X
 """
 
 import dataclasses as dc
+import functools
 import itertools
 import math
-from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, ParamSpec, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -49,6 +50,23 @@ _VISIBLE = 0.1  # least variance of that grid, as a share of the variance by the
 # An arm may well be too exact for the corners to tell; prior odds of that, in units of the prior of one e-fold of
 # variance. Less makes the covariance too large for exact arms, more too small for arms that are just visible.
 _EXACT_ARM = 20.0
+_NO_SOLUTION = "hand-eye: no solution; do the poses belong to the images?"
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+
+def _or_refused(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """The function, with ConfigError where a matrix is singular: its numbers are those of no board, or of no arm."""
+
+    @functools.wraps(function)
+    def called(*args: _Arguments.args, **options: _Arguments.kwargs) -> _Result:
+        try:
+            with np.errstate(all="ignore"):  # a warning of numpy's would be a line of its own on the terminal
+                return function(*args, **options)
+        except np.linalg.LinAlgError as error:
+            raise ConfigError(_NO_SOLUTION) from error
+
+    return called
 
 
 @dc.dataclass(frozen=True)
@@ -161,6 +179,7 @@ def _boards(lens: LensModel, points: np.ndarray, px: np.ndarray) -> list[_BoardP
     return sorted(out, key=lambda pose: pose.squares)
 
 
+@_or_refused
 def observe(
     lens: LensModel,
     points: np.ndarray,
@@ -187,6 +206,7 @@ def observe(
     )
 
 
+@_or_refused
 def settled(seen: Seen, used: Sequence[int] | None = None) -> Seen:
     """The views, each with that of its two board poses that agrees with the arm by the fit to the views `used`."""
     for _ in range(3):
@@ -251,6 +271,7 @@ def _arm_errors(X: np.ndarray, Y: np.ndarray, seen: Seen) -> tuple[np.ndarray, n
 # ---------------------------------------------------------------- the fit
 
 
+@_or_refused
 def solve(seen: Seen, X: np.ndarray | None = None) -> Fit:
     """The camera and the board from all views, from the start X or a closed form. Raises ConfigError."""
     X = closed_hand_eye(seen.carriers(), seen.board) if X is None else X
@@ -263,7 +284,7 @@ def solve(seen: Seen, X: np.ndarray | None = None) -> Fit:
         steps, covariances, weights, variances = _gridded(e, B, V, window)
         step = weights @ steps
         if not np.isfinite(step).all():
-            raise ConfigError("hand-eye: no solution; do the poses belong to the images?")
+            raise ConfigError(_NO_SOLUTION)
         # Poses of other images start far off: a step is limited to a rotation in which the problem is nearly linear.
         step *= min(1.0, _MAX_TURN / max(np.abs(step[[0, 1, 2, 6, 7, 8]]).max(), 1e-12))
         X, Y = frames.stepped(X, step[:6]), frames.stepped(Y, step[6:])
@@ -380,17 +401,18 @@ def published(carriers: Poses, boards: Poses, method: int) -> np.ndarray:
             method=method,
         )
     except cv2.error as error:
-        raise ConfigError("hand-eye: no solution; do the poses belong to the images?") from error
+        raise ConfigError(_NO_SOLUTION) from error
     finally:
         logging.setLogLevel(level)
     if not (np.isfinite(t).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-3):  # also false for NaN
-        raise ConfigError("hand-eye: no solution; do the poses belong to the images?")
+        raise ConfigError(_NO_SOLUTION)
     return frames.make(R, t.ravel())
 
 
 # ---------------------------------------------------------------- blunders
 
 
+@_or_refused
 def deviations(fit: Fit, seen: Seen, used: Sequence[int] = ()) -> np.ndarray:
     """(n,) how far each view is off the fit, in standard deviations (rms of six). `used`: those that made the fit."""
     e, B, V = _arm_errors(fit.X, fit.Y, seen)
@@ -453,6 +475,7 @@ def hand_eye(
     return from_seen(observe(lens, points, corners, X_BE, to_hand), lens, points, corners)
 
 
+@_or_refused
 def from_seen(seen: Seen, lens: LensModel, points: np.ndarray, corners: Sequence[np.ndarray]) -> HandEye:
     """As `hand_eye`, of views observed already."""
     closed_hand_eye(seen.carriers(), seen.board)  # refuses poses that do not determine the camera
@@ -516,6 +539,7 @@ def _compared(seen: Seen, X: np.ndarray) -> dict[str, Method]:
     return out
 
 
+@_or_refused
 def disagreement(seen: Seen) -> np.ndarray:
     """How far all views are apart about the closed form: (2,) rms [deg], [mm]. Raises ConfigError."""
     X = closed_hand_eye(seen.carriers(), seen.board)
