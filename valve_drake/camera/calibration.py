@@ -49,7 +49,7 @@ _POWER = (2, 4, 1, 1, 6)  # the power of the radius with which each term acts
 # first for wide-angle lenses, which distort more.
 _PRIOR = (0.2, 0.1, 2e-3, 2e-3, 0.05)
 _MAP = (7, 9)  # rows and columns of the map of standard deviations
-_POOR = 0.2  # a fisheye model is tried if a camera's corners have a larger rms than this [px]
+_FISHEYE_RMS = 0.2  # a fisheye model is tried if a camera's corners have a larger rms than this [px]
 _FISHEYE = 0.6  # the images are a fisheye's if its model leaves less than this share of the pinhole's rms
 _WORSE = 1.2  # factor by which the rms may rise when terms are dropped because the lens would fold back
 _MISFIT = 10.0  # pairs are refused if the rms of both cameras together exceeds 1 px + this times that of each alone
@@ -417,7 +417,7 @@ def _refuse_fisheye(start: _Start, size: tuple[int, int]) -> None:
     """Raises ConfigError where a fisheye's model explains the corners of a camera much better than a pinhole's."""
     views = start.views
     for c, rms in enumerate(start.alone):
-        if rms < _POOR:
+        if rms < _FISHEYE_RMS:
             continue
         bodies = sorted({view.body for view in views})
         groups = [[view for view in views if view.body == body] for body in bodies]

@@ -46,6 +46,7 @@ class LogWriter:
 
     Only a log that holds no message yet when an exception comes is not kept: the run was refused before it began.
     path: the log's name, the next free one if `path` is taken (ActiveFile, also for the arguments); `note` says so.
+    spent: processor time of the thread so far [s].
     """
 
     def __init__(self, path: str | os.PathLike[str], *, companions: Sequence[str] = (), overwrite: bool = False):

@@ -159,13 +159,13 @@ class RobotLink:
         self.groups = groups
         self._sizes = vectors(groups)
         self._silent = [SAID_BY[device] for device in groups.absent]
-        self._said, self._told = present(REPORTS, groups), present(COMMANDS, groups)
+        self._report_rows, self._command_rows = present(REPORTS, groups), present(COMMANDS, groups)
         # Reports of what is never still for noise, and the port that tells of a force: unknown when they stay away.
         self._forces = {f"{side}_wrist_sensor.status": f"{side}_wrist.wrench" for side in SIDES}
         for side in SIDES:
             if f"{side}_wrist_sensor" in groups.absent:
                 self._forces[f"{side}_arm.status"] = f"{side}_arm.torque_measured"
-        self._devices = (*(row.device for row in self._said), *IMAGES, "robot")  # in the order of `_diagnose`
+        self._devices = (*(row.device for row in self._report_rows), *IMAGES, "robot")  # in the order of `_diagnose`
         self.stop = stop
         self._config = bus.config
         self._idle = idle or (lambda: wall.sleep(2e-4))
@@ -277,7 +277,7 @@ class RobotLink:
         Raises OperationFailed if the robot does not answer or another program is there, ConfigError if it is not the
         robot of this program.
         """
-        needed = [row.key for row in self._said] + [STATE]
+        needed = [row.key for row in self._report_rows] + [STATE]
         alone = self.bus.claim(CONTROLLER)
 
         def ready() -> bool:
@@ -372,7 +372,7 @@ class RobotLink:
         now, time = self.clock(), self._time
         self._delay.close(time)
         values: Values = {name: np.zeros(self._sizes[name]) for name in self._silent}
-        for row in self._said:
+        for row in self._report_rows:
             report = self._reports[row.key]
             values |= report.values
             if row.key in self._forces and not now - report.arrival <= self._config.report_age:
@@ -384,7 +384,7 @@ class RobotLink:
         return Snapshot(values, self._shown(time), self._health)
 
     def _diagnose(self, now: float, time: float) -> Health:
-        ages = [now - self._reports[row.key].arrival for row in self._said]
+        ages = [now - self._reports[row.key].arrival for row in self._report_rows]
         for camera, row in IMAGES.items():
             since = self._requests.since.get(camera)
             last = self._reports[row.key].arrival if row.key in self._reports else -math.inf
@@ -448,7 +448,7 @@ class RobotLink:
     def send(self, time: float, commands: Values) -> None:
         """Publishes the commands of the tick that began at `time`."""
         stamp = to_utime(time)
-        for row in self._told:
+        for row in self._command_rows:
             self.bus.send(row.key, row.encode(stamp, commands))
         changed = self._requests.update(time, self.clock())
         if changed or round(time / TICK) % round(self._config.request_period / TICK) == 0:

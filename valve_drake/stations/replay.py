@@ -3,16 +3,15 @@
 It shows every reader what that reader was shown when the log was written, to the bit. The recorder publishes at every
 tick and sees what was there before the tick's updates; a stage reads in the slot that it runs in (ports.py). Hence
 
-| what               | is recorded at                                   | and is shown again               |
-|--------------------|--------------------------------------------------|----------------------------------|
-| all vectors        | every tick, which is when robot_state reads them | from that tick on                |
-| health             | the tick after it appeared                       | from right after the tick before |
-| images             | the tick after a stage has looked at one         | from right after the tick before |
-| operators' packets, | the tick after it was given                     | given right after the tick before |
-| the own command    |                                                  |                                   |
+| what                 | is recorded at                                   | and is shown again               |
+|----------------------|--------------------------------------------------|----------------------------------|
+| all vectors          | every tick, which is when robot_state reads them | from that tick on                |
+| health               | the tick after it appeared                       | from right after the tick before |
+| images               | the tick after a stage has looked at one         | from right after the tick before |
+| own command, packets | the tick after it was given                      | from right after the tick before |
 
 An image is the recorded JPEG, decoded as the live camera does, with the capture time and the sequence that its consumer
-passed on. Images that no stage looked at are not in a log: who looks at another time sees the last recorded one.
+passed on. A log holds only the images that a stage looked at: a stage that looks at another time gets the last of them.
 """
 
 import bisect
