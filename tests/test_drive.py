@@ -203,6 +203,13 @@ def test_only_a_fixed_base_begins_right_before_the_valve(omni, bolted):
     robot_of(load(None, [f"robot={bolted}", "simulation.start.distance=0.7"]))
 
 
+def test_a_large_base_begins_where_it_has_room_to_turn(tmp_path):
+    large = variant(tmp_path, change=lambda given: given["base"].update(footprint=[0.7, 0.6], stand=[]))
+    with pytest.raises(ConfigError, match="start.distance must be at least 1.122 for a base that drives, got 1.0"):
+        robot_of(load(None, [f"robot={large}", "simulation.start.distance=1"]))
+    robot_of(load(None, [f"robot={large}", "simulation.start.distance=1.2"]))
+
+
 def test_a_state_tells_the_speeds_that_the_base_has():
     assert RobotState(odometry=[1, 2, 3]).twist.tolist() == []
     assert RobotState(odometry=[1, 2, 3, 4, 5, 6]).twist.tolist() == [4, 5, 6]

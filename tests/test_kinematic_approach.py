@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
 from robot_facts import ARMS_HOME as HOME
-from robot_facts import LIMITS, ROBOT
+from robot_facts import LIMITS, ROBOT, robot_state
+from robot_variants import variant
 
 from valve_drake import resources
 from valve_drake.behaviors import stance_planner
@@ -408,6 +409,18 @@ def test_a_way_round_an_obstacle_stays_within_the_joint_limits(base, detour):
     assert status.state == "succeeded", status.detail
     assert min(q[2] for q in bench.commands) <= HOME[2] - detour + 0.05  # it did go round
     assert np.all(np.abs(bench.commands) <= np.tile(LIMITS, 2))
+
+
+@pytest.mark.parametrize(("stand", "obstacle"), [([0.7, 0.84], False), ([0.7, 1.5], True)])
+def test_a_valve_is_an_obstacle_as_far_as_the_arms_reach(tmp_path, stand, obstacle):
+    robot = Robot.load(variant(tmp_path, change=lambda given: given["base"].update(stand=stand)))
+    law, far = KinematicApproach(CONFIG, robot, VALVE, AREA), compose(X_OA, make(np.eye(3), np.array([0, 0, 0.25])))
+    measured = Memory(activation=1, q=HOME + 0.2, X_OA=far)
+    state = robot_state(odometry=[0, 0, 0, 0, 0], torso=ROBOT.torso.home, left_arm=HOME[:6], right_arm=HOME[6:])
+    mode, others = ModeState(mode=Mode.FOLD, activation=2), (TurnState(), GraspPlan(), PathPlan())
+    read = Inputs(state, mode, RectangleEstimate(), HandleMarks(), *others)
+    after, _ = law.step(1.0, measured, read)
+    assert 1.5 < np.hypot(*far[:2, 3]) < 2.0 and after.phase == "planning" and after.request.valve == obstacle
 
 
 # ---------------------------------------------------------------- verify

@@ -2,13 +2,14 @@
 
 import dataclasses as dc
 import itertools
+import sys
 
 import numpy as np
 import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
 from robot_facts import ROBOT, robot_state
 
-from valve_drake.behaviors.valve_search import Memory, ValveSearchConfig, aim, bolted, step
+from valve_drake.behaviors.valve_search import USUAL, Memory, Sight, ValveSearchConfig, aim, bolted, step
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.checks import ConfigError
 from valve_drake.frames import apply, inverse, make
@@ -76,13 +77,15 @@ class World:
             self.base = self.base + [0, 0, self.rate * DT]
 
 
-def search(world: World, limit: float = 60.0, config: ValveSearchConfig = CONFIG, base=DIFFERENTIAL):
+def search(
+    world: World, limit: float = 60.0, config: ValveSearchConfig = CONFIG, base=DIFFERENTIAL, sight: Sight = USUAL
+):
     """Runs one search -> status, time, commanded torsos (n, 3)."""
     memory, mode, torsos = Memory(), ModeState(mode="search", activation=4), []
     for k in range(int(limit / DT)):
         robot = world.tick(k)
         memory, command, status = step(
-            config, memory, k * DT, DT, robot, mode, world.position, RectangleEstimate(), HEAD, drive=base
+            config, memory, k * DT, DT, robot, mode, world.position, RectangleEstimate(), HEAD, drive=base, sight=sight
         )
         world.obey(command)
         torsos.append(command.torso)
@@ -116,6 +119,26 @@ def test_a_head_that_turns_little_leaves_no_direction_out(pan):
         status, time, torsos, _ = search(world, config=config)
         assert status.state == "succeeded", (bearing, status.detail)
         assert np.abs(torsos[:, 2]).max() <= pan and time < 45
+
+
+def test_eyes_with_a_long_lens_leave_no_direction_out(monkeypatch):
+    """A head that turns to 80 degrees sees all round from two headings of the base by our lens, and not by theirs."""
+    half = (0.12, VIEW[1])
+    monkeypatch.setattr(sys.modules[__name__], "VIEW", half)
+    config = dc.replace(CONFIG, sweep_yaw=1.4, yaw_limit=1.4, sweep_waist=0.0, pitches=[CONFIG.pitches[0]])
+    for bearing in (1.53, 1.57, 1.61, -1.57):
+        status, *_ = search(
+            World(around(bearing, 3.0, 1.0), np.random.default_rng(3)), config=config, sight=Sight.of(*half)
+        )
+        assert status.state == "succeeded", (bearing, status.detail)
+
+
+def test_a_fixed_robot_looks_down_in_steps_that_its_lens_sees():
+    assert Sight.of(*VIEW) == USUAL  # ours
+    half = 0.09
+    pitches = bolted(CONFIG, Sight.of(half, half)).pitches
+    steps = np.diff([pitch for pitch in pitches if pitch >= max(CONFIG.pitches)])
+    assert steps.max() < 2 * half and max(pitches) > CONFIG.pitch_high - 2 * half
 
 
 def test_a_fixed_robot_that_sees_nothing_says_so_within_the_modes_deadline():

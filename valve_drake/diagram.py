@@ -30,7 +30,7 @@ from valve_drake.behaviors.stance_planner import StancePlanner
 from valve_drake.behaviors.stance_planner_system import StancePlannerSystem
 from valve_drake.behaviors.stance_search import Stances
 from valve_drake.behaviors.taught import load_taught
-from valve_drake.behaviors.valve_search import GazeLimits, ValveSearchConfig, reachable
+from valve_drake.behaviors.valve_search import GazeLimits, Sight, ValveSearchConfig, reachable
 from valve_drake.behaviors.valve_search_system import ValveSearchSystem
 from valve_drake.camera.lens import StereoHead, load_head
 from valve_drake.checks import ConfigError, require
@@ -65,7 +65,8 @@ from valve_drake.supervisor.supervisor_system import SupervisorSystem
 from valve_drake.task.modes import BEHAVIORS
 from valve_drake.valve.valve import turned
 
-DRIVING_START = 0.9  # a robot that drives begins no nearer to the valve: its base and arms are clear of the panel [m]
+# A robot that drives begins no nearer to the valve, nor than it has room to turn: base and arms are clear of the panel.
+DRIVING_START = 0.9  # [m]
 
 MEASURED = tuple(spec.name for spec in CONTRACT if spec.direction == "out" and not isinstance(spec.kind, type))
 
@@ -184,9 +185,10 @@ def robot_of(scenario: Scenario) -> Robot:
     except ConfigError as error:
         raise ConfigError(f"{scenario.robot}: {error}") from error
     distance = scenario.simulation.start.distance
-    least = distance.min if isinstance(distance, Uniform) else distance
-    words = f"at least {DRIVING_START:g} for a base that drives"
-    require(robot.drive.fixed or least >= DRIVING_START, "simulation.start.distance", words, least)
+    nearest = distance.min if isinstance(distance, Uniform) else distance
+    least = max(DRIVING_START, math.ceil(1e3 * robot.turning_room) / 1e3)
+    words = f"at least {least:g} for a base that drives"
+    require(robot.drive.fixed or nearest >= least, "simulation.start.distance", words, nearest)
     return robot
 
 
@@ -308,6 +310,16 @@ def _check_seen(scenario: Scenario, head: StereoHead, robot: Robot) -> None:
     require(grow <= 1.0, "valve.marker.size", words, size)
 
 
+def _sight(head: StereoHead) -> Sight:
+    """What both eyes see at once."""
+    halves = [
+        (math.atan2(lens.width / 2, fx), math.atan2(lens.height / 2, fy))
+        for lens in head.lenses()
+        for fx, fy in (lens.magnification(),)
+    ]
+    return Sight.of(*map(min, zip(*halves)))
+
+
 def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
     """All blocks between the station's outputs and its inputs: the same objects for every station."""
     head = _head(scenario)
@@ -344,6 +356,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             robot.gaze_signs,
             look=valve.look(),
             drive=robot.drive,
+            sight=_sight(head),
         ),
         BaseApproachSystem(scenario.base_approach, valve, robot.drive, robot.turning_room),
         StancePlannerSystem(StancePlanner(scenario.stance_planner, stances)),

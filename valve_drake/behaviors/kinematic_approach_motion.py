@@ -88,8 +88,10 @@ class Inputs(NamedTuple):
     path: PathPlan
 
 
-FRESH = 2.5  # if it is not older; in the modes before fold there is one every two seconds [s]
-NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms [m]
+FRESH = 2.5  # an older estimate does not tell where the valve is now; before fold there is one every two seconds [s]
+FARTHEST_MOVE = 1.5  # a marker that is seen farther from where it was is another one [m]
+NEAR = 1.5  # a valve farther from the base than this is no obstacle to the arms, unless they reach as far [m]
+ASIDE = 0.5  # by which a valve may be farther than the farthest stance: a stance may be to one side of it [m]
 
 
 class Motion:
@@ -122,7 +124,7 @@ class Motion:
             return None
         since = self._by_hands(m, turn) - m.counted
         X_BA = compose(inverse(planar(*state.odometry[:3])), turned(m.X_OA, since))
-        return X_BA if np.hypot(*X_BA[:2, 3]) < NEAR else None
+        return X_BA if np.hypot(*X_BA[:2, 3]) < max(NEAR, self.robot.stand[1] + ASIDE) else None
 
     def _shifted(self, time: float, m: Memory, estimate: RectangleEstimate, turn: TurnState) -> Memory:
         """The valve where the cameras have just seen it, if that is not where it was measured: somebody moved it."""
@@ -132,7 +134,7 @@ class Motion:
         if not self.valve.fixed:  # a marker off the axis goes round with the valve
             p_OV = apply(compose(turned(m.X_OA, self._by_hands(m, turn) - m.counted), inverse(m.X_OA)), p_OV)
         shift = apply(estimate.X_OL, estimate.X_LV[:, 3]) - p_OV
-        if not MOVED < np.linalg.norm(shift) < NEAR:
+        if not MOVED < np.linalg.norm(shift) < FARTHEST_MOVE:
             return m
         return changed(m, X_OA=make(m.X_OA[:, :3], m.X_OA[:, 3] + shift), p_OV=m.p_OV + shift)
 

@@ -1,6 +1,6 @@
 """The gaze: the search for the valve, and keeping it in view afterwards.
 
-Owns the torso (waist twist, neck pitch, neck yaw) in every mode, and the base while searching.
+Owns the torso (waist twist, neck pitch, neck yaw) in every mode but the final ones, and the base while searching.
 
     search   The gaze (waist + neck yaw) sweeps to one end and across, the base turns by half a turn to that side, so
              that the gaze goes on over what is new, and it sweeps back (three sweeps and thirds of a turn if the gaze
@@ -49,8 +49,6 @@ HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading
 
 # A valve that is seen so far from where it was measured may have been moved; estimates scatter by 2 mm [m].
 MOVED = 0.03
-VIEW = 0.2  # a marker so far beside the optical axis is seen whole; lower it for longer lenses [rad]
-LOWER = 0.22  # between two rounds of a fixed robot, less than the eyes see at once; lower it for longer lenses [rad]
 DRIVING = tuple(mode for mode in WATCHED if TABLE[mode].base != HOLD)
 
 
@@ -108,6 +106,25 @@ class GazeLimits:
     pitch: tuple[float, float]
     pan: float
     waist: float | None
+
+
+@dc.dataclass(frozen=True)
+class Sight:
+    """What the eyes see at once [rad]; the defaults are those of lenses that are as long as ours, or shorter.
+
+    aside: a marker so far beside the optical axis is seen whole, by both. lower: between two rounds of a fixed robot.
+    """
+
+    aside: float = 0.2
+    lower: float = 0.22
+
+    @staticmethod
+    def of(half_width: float, half_height: float) -> "Sight":
+        """half_width, half_height: half the field of the narrower eye [rad]."""
+        return Sight(min(Sight.aside, 0.8 * half_width), min(Sight.lower, 1.2 * half_height))
+
+
+USUAL = Sight()
 
 
 def reachable(config: ValveSearchConfig, limits: GazeLimits) -> tuple[ValveSearchConfig, list[str]]:
@@ -218,6 +235,7 @@ def step(
     head_pose: HeadPose,
     look: np.ndarray | None = None,
     drive: Drive = DIFFERENTIAL,
+    sight: Sight = USUAL,
 ) -> tuple[Memory, Command, Status]:
     """One tick of length dt -> memory, command, status. look: where to look, off the marker's middle, in V (3,)."""
     m = memory
@@ -233,7 +251,7 @@ def step(
 
     twist = None
     if mode.mode == Mode.SEARCH:
-        m, goal = _search(config, m, time, dt, base, position, head_pose, _sweeps(config, drive))
+        m, goal = _search(config, m, time, dt, base, position, head_pose, _sweeps(config, drive, sight), sight)
         twist = None if drive.fixed else drive.part(np.array([0.0, 0.0, m.turn_rate]))
     else:
         m = _sight(config, m, position, estimate)
@@ -253,7 +271,11 @@ def step(
     ]
     torso, velocity = np.array(new), np.array([(after - before) / dt for after, before in zip(new, now)])
     m = changed(m, torso=torso, velocity=velocity, goal=goal)
-    return m, Command(time=time, torso=torso, base_twist=twist), _status(config, m, time, mode, _sweeps(config, drive))
+    return (
+        m,
+        Command(time=time, torso=torso, base_twist=twist),
+        _status(config, m, time, mode, _sweeps(config, drive, sight)),
+    )
 
 
 def _begin(m: Memory, time: float, mode: ModeState, base: np.ndarray) -> Memory:
@@ -293,19 +315,19 @@ def _end(m: Memory, result: str, verdict: str = Verdict.NONE, detail: str = "") 
     return changed(m, result=result, verdict=str(verdict), detail=detail)
 
 
-def bolted(config: ValveSearchConfig) -> ValveSearchConfig:
+def bolted(config: ValveSearchConfig, sight: Sight = USUAL) -> ValveSearchConfig:
     """The config of a search without a base that turns."""
-    steeper = np.arange(max(config.pitches) + LOWER, config.pitch_high, LOWER).tolist()
+    steeper = np.arange(max(config.pitches) + sight.lower, config.pitch_high, sight.lower).tolist()
     first = [pitch for pitch in sorted(config.pitches) if pitch >= config.pitches[0]]
     rest = [pitch for pitch in config.pitches if pitch not in first]
     return dc.replace(config, pitches=[*first, *steeper, *rest])
 
 
-def _sweeps(config: ValveSearchConfig, drive: Drive) -> int:
+def _sweeps(config: ValveSearchConfig, drive: Drive, sight: Sight) -> int:
     """Of a round: as many as see all round, from as many headings of the base."""
     if drive.fixed:
         return 1
-    return math.ceil(np.pi / (config.sweep_yaw + config.sweep_waist + VIEW))
+    return math.ceil(np.pi / (config.sweep_yaw + config.sweep_waist + sight.aside))
 
 
 def _status(config: ValveSearchConfig, m: Memory, time: float, mode: ModeState, sweeps: int) -> Status:
@@ -409,6 +431,7 @@ def _search(
     position: StereoPosition,
     head_pose: HeadPose,
     sweeps: int,
+    sight: Sight,
 ) -> tuple[Memory, np.ndarray]:
     """One tick of the search -> memory, torso goal. sweeps: of a round; between two the base turns."""
     turned = wrap(float(base[2]) - m.heading)
@@ -424,7 +447,7 @@ def _search(
             return m, m.goal
         neck = aim(head_pose, base, m.goal, m.looks[-1][0])
         return m, np.array([m.goal[0], *_neck(config, *neck)])
-    return _sweep(config, m, dt, float(base[2]), sweeps)
+    return _sweep(config, m, dt, float(base[2]), sweeps, sight)
 
 
 def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPosition) -> Memory:
@@ -451,7 +474,9 @@ def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPos
     return _end(m, "succeeded", detail=f"marker {distance:.2f} m away, {p_OV[2]:.2f} m high")
 
 
-def _sweep(config: ValveSearchConfig, m: Memory, dt: float, heading: float, round_: int) -> tuple[Memory, np.ndarray]:
+def _sweep(
+    config: ValveSearchConfig, m: Memory, dt: float, heading: float, round_: int, sight: Sight
+) -> tuple[Memory, np.ndarray]:
     """Moves the gaze on, or the base between two sweeps -> memory, torso goal. round_: sweeps of one."""
     end = config.sweep_yaw + config.sweep_waist
     pitch = config.pitches[max(m.sweeps, 0) // round_]
@@ -468,7 +493,7 @@ def _sweep(config: ValveSearchConfig, m: Memory, dt: float, heading: float, roun
     m = changed(m, gaze=float(gaze))
     # It does not turn back before its images join those of the next sweep.
     unseen = m.side * wrap(heading + m.gaze - m.seen_azimuth)
-    if gaze == m.side * end and unseen <= max(end + VIEW - np.pi / round_, 0.1):
+    if gaze == m.side * end and unseen <= max(end + sight.aside - np.pi / round_, 0.1):
         sweeps = m.sweeps + 1
         onward = m.side if sweeps % round_ % 2 else -m.side  # every turn of a round goes the same way
         turn = onward * 2 * np.pi / round_ if sweeps % round_ else 0.0

@@ -4,7 +4,7 @@ import dataclasses as dc
 
 import numpy as np
 
-from valve_drake.behaviors.valve_search import HeadPose, Memory, ValveSearchConfig, bolted, step
+from valve_drake.behaviors.valve_search import USUAL, HeadPose, Memory, Sight, ValveSearchConfig, bolted, step
 from valve_drake.memory import changed
 from valve_drake.messages import (
     Command,
@@ -45,8 +45,8 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
     of them is the waist; None: the robot has none. The last two are tilt and pan. The gaze is that of waist (0 if there
     is none), tilt and pan. The lift is driven to the stance's in fine_approach, and stays there. signs: of waist, tilt
     and pan: 1 for a joint that turns it to the left, down, left as it grows (3,); None: all do.
-    look: where to look near the valve, off the marker's middle, in V (3,); None: at the marker. drive:
-    of the base.
+    look: where to look near the valve, off the marker's middle, in V (3,); None: at the marker. drive: of the base.
+    sight: of the eyes.
     """
 
     OUTPUTS = {"command": Command, "status": Status}
@@ -60,12 +60,13 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         signs: np.ndarray | None = None,
         look: np.ndarray | None = None,
         drive: Drive = DIFFERENTIAL,
+        sight: Sight = USUAL,
         name: str = "valve_search",
     ):
         config.check()
         self.config = config if waist is not None else dc.replace(config, sweep_waist=0.0)
         if drive.fixed:
-            self.config = bolted(self.config)
+            self.config = bolted(self.config, sight)
         else:
             speed, acceleration = float(drive.speed[-1]), float(drive.acceleration[-1])
             self.config = dc.replace(
@@ -73,7 +74,7 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
                 turn_speed=min(config.turn_speed, speed),
                 turn_acceleration=min(config.turn_acceleration, acceleration),
             )
-        self._rest, self._waist, self._look, self._drive = rest, waist, look, drive
+        self._rest, self._waist, self._look, self._drive, self._sight = rest, waist, look, drive, sight
         self._signs = np.ones(3) if signs is None else signs
         self._plain = waist == 0 and len(rest) == 3 and bool((self._signs > 0).all())  # the torso is the gaze
         self._whole_pose = head_pose
@@ -104,6 +105,7 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
             head_pose,
             self._look,
             self._drive,
+            self._sight,
         )
         if command.torso is not None and not self._plain:
             command = dc.replace(command, torso=self._torso(command.torso, lift))
