@@ -860,5 +860,5 @@ def test_an_image_that_comes_after_a_newer_one_is_not_looked_at():
     law = KinematicApproach(CONFIG, ROBOT, VALVE, AREA)
     memory = Memory(since=1.0)
     for sequence, time in ((3, 2.0), (5, 2.25), (4, 2.125), (6, 2.25), (7, 2.375)):
-        memory = law._look(3.0, memory, RectangleEstimate(found=True, sequence=sequence, time=time))
+        memory = law._look(memory, RectangleEstimate(found=True, sequence=sequence, time=time))
     assert [look.time for look in memory.looks] == [2.0, 2.25, 2.375]

@@ -16,7 +16,7 @@ import numpy as np
 
 from valve_drake.diagram import OPERATOR, PACKETS, listens, make_blocks, recorded_from, wires_of
 from valve_drake.messages import ModeState, OperatorCommand, OperatorPackets
-from valve_drake.ports import SLOT, TICK, Block, Held, Source, Step
+from valve_drake.ports import SLOT, TICK, Block, Held, Source
 from valve_drake.recording.recorder_system import RecorderSystem
 from valve_drake.recording.signals import JOINED, topic_of
 from valve_drake.scenario import Scenario
@@ -47,8 +47,7 @@ class _Played:
         self.ports = {port: f"{block.get_name()}.{port}" for port in block.OUTPUTS}
         self.sources: dict[str, Source] = {}
         self.asleep: ModeState | None = None  # in what it was found asleep: it sleeps on while this is the mode
-        # Every `period` slots from slot `offset` on: work.
-        self.works = [(_slots(period), _slots(offset), work) for period, offset, work in block.schedule]
+        self.period, self.offset = _slots(block.period), _slots(block.offset)  # of its steps [slots]
 
 
 class _Message:
@@ -68,7 +67,7 @@ class _Shown:
     def __init__(self) -> None:
         self.sent: dict[int, dict[str, _Message]] = {}  # by the tick that recorded it
 
-    def update(self, work: Step, time: float, *_: Any) -> tuple[None, dict[str, _Message]]:
+    def update(self, time: float, *_: Any) -> tuple[None, dict[str, _Message]]:
         return None, self.sent.get(math.floor(time / TICK) + 1, {})
 
 
@@ -112,16 +111,10 @@ class Player:
         recorder.listen(self._recorded)
         self._show(recording)
         self._blocks = blocks
-        cycle = math.lcm(*(period for played in blocks for period, _, _ in played.works))
-        # Which works are due in each slot of a cycle; `offset` is when a work is due first.
-        self._due: list[list[tuple[_Played, int, Step]]] = [
-            [
-                (played, offset, work)
-                for played in blocks
-                for period, offset, work in played.works
-                if (slot - offset) % period == 0
-            ]
-            for slot in range(cycle)
+        cycle = math.lcm(*(played.period for played in blocks))
+        # Which blocks are due in each slot of a cycle.
+        self._due: list[list[_Played]] = [
+            [played for played in blocks if (slot - played.offset) % played.period == 0] for slot in range(cycle)
         ]
 
     @property
@@ -150,10 +143,10 @@ class Player:
         values, due = self._values, self._due
         while (time := self.time) < until:
             mode, done = values["supervisor.mode"], []
-            for played, offset, work in due[self._slot % len(due)]:  # each reads what was there before
-                if self._slot < offset or played.asleep is mode:
+            for played in due[self._slot % len(due)]:  # each reads what was there before
+                if self._slot < played.offset or played.asleep is mode:
                     continue
-                updated = played.stepped.update(work, time, played.sources, time, played.held)
+                updated = played.stepped.update(time, played.sources, time, played.held)
                 if updated is None:
                     played.asleep = mode
                 else:

@@ -30,7 +30,6 @@ Every block uses UNRESTRICTED updates: Drake makes them all from the state befor
 afterwards, would see what the other blocks have made of the same instant.
 """
 
-import functools
 import operator
 import types
 import typing
@@ -198,12 +197,8 @@ class Block(PythonSystem, Generic[In, M]):
                 raise TypeError(f"{name}.{port}: an output is a message class or the size of a vector")
             self.DeclareStateOutputPort(port, state)
         self.updates = 0  # of outputs, in any Context: while it stays, none has changed
-        self.period = period
-        self.schedule: list[tuple[float, float, Step]] = [
-            (period, slot * SLOT + delay, self.step)
-        ]  # period, offset [s]
-        for every, offset, work in self.schedule:
-            self.DeclarePeriodicUnrestrictedUpdateEvent(every, offset, functools.partial(self._update, work))
+        self.period, self.offset = period, slot * SLOT + delay  # offset: of the first step [s]
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, self.offset, self._update)
 
     def initial(self) -> M:
         """The memory before the first step; its arrays are locked. A block that keeps none need not write it."""
@@ -227,7 +222,7 @@ class Block(PythonSystem, Generic[In, M]):
         return memory
 
     def update(
-        self, work: "Step", time: float, sources: "Mapping[str, Source]", where: Any, held: "Held"
+        self, time: float, sources: "Mapping[str, Source]", where: Any, held: "Held"
     ) -> "tuple[Held, Outputs] | None":
         """One step on the ports `sources` evaluated in `where`; None while the block sleeps."""
         inputs = self._inputs(sources, where)
@@ -239,17 +234,17 @@ class Block(PythonSystem, Generic[In, M]):
                 if held.asleep == activation:
                     return None
         with profiling.work(profiling.STAGE, self._name):
-            memory, outputs = work(time, inputs, held.value)
+            memory, outputs = self.step(time, inputs, held.value)  # type: ignore[arg-type]
         for port, value in outputs.items():
             kind = self.OUTPUTS[port]
             if isinstance(kind, type) and not isinstance(value, kind):
                 raise TypeError(f"{self.get_name()}.{port}: want {kind}, got {type(value).__name__}")
         return type(held)(memory, activation, held.value), outputs
 
-    def _update(self, work: "Step", context: Context, state: State) -> EventStatus | None:
+    def _update(self, context: Context, state: State) -> EventStatus | None:
         abstract = state.get_mutable_abstract_state()
         memory = abstract.get_mutable_value(self._memory)  # Drake has put there what is in `context`
-        updated = self.update(work, context.get_time(), self.sources, context, memory.get_value())
+        updated = self.update(context.get_time(), self.sources, context, memory.get_value())
         if updated is None:
             return _ASLEEP
         held, outputs = updated
@@ -266,8 +261,6 @@ class Block(PythonSystem, Generic[In, M]):
 
 
 _ASLEEP = EventStatus.DidNothing()  # where all blocks of an instant say so, Drake writes no state and forgets no value
-
-Step = Callable[[float, Any, Any], tuple[Any, Outputs]]
 
 
 class Held:

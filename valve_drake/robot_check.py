@@ -118,7 +118,6 @@ class Report:
 
     source: str
     name: str
-    scenario: str
     findings: list[Finding] = dc.field(default_factory=list)
     groups: dict[str, list[dict[str, Any]]] = dc.field(default_factory=dict)
     grippers: dict[str, dict[str, float]] = dc.field(default_factory=dict)
@@ -168,7 +167,7 @@ def _plain(row: Reach | Servo) -> dict[str, Any]:
 def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
     """The robot of a scenario, `source` is its robot.yaml's name. Raises ConfigError if that cannot be read."""
     start = time.process_time()
-    report = Report(source, Path(source).name, "", least_margin=scenario.stance.margin_min)
+    report = Report(source, Path(source).name, least_margin=scenario.stance.margin_min)
     file = named_files.find(scenario, "robot")
     report.name = Path(descriptions.load(file).model).stem
     try:

@@ -29,7 +29,7 @@ from valve_drake.messages import (
     Status,
     Verdict,
 )
-from valve_drake.robot.kinematics import RobotKinematics
+from valve_drake.robot.kinematics import STRIDE, RobotKinematics
 
 STRAIGHT = np.array([0.0, 0.0, 1.0])  # the way of a hand to its handle, in its frame
 TICKS = 3  # in a row that a touch takes
@@ -114,7 +114,7 @@ class BlindServo:
             return hand
         X_BG = make(hand.X_BG[:, :3], hand.X_BG[:, 3] + step * min(1.0, c.speed * dt / left))
         q = self.robot.inverse(side, X_BG, hand.q, state.posture)
-        if q is None or np.max(np.abs(q - hand.q)) > 0.5:
+        if q is None or np.max(np.abs(q - hand.q)) > STRIDE:
             return hand  # out of reach, or the wrist would turn by far: keep the command
         return changed(hand, X_BG=X_BG, q=q)
 

@@ -28,6 +28,7 @@ from valve_drake.frames import cross
 from valve_drake.robot.kinematics import HandLoad
 
 GRAVITY = 9.81
+SOFT_TORQUE, SOFT_LEAD = 0.3, 0.25  # last shares of the limits, over which the rate falls to zero
 BELOW_TRIP = 0.9  # of the force that ends a turn: what the hands drive with, at most
 
 
@@ -153,7 +154,7 @@ def turn_rate(
     acceleration = config.rate / config.ramp
     brake = math.sqrt(2 * acceleration * max(left, 0.0))
     wanted = max(config.slow, min(config.rate, brake)) if left > 0 else 0.0
-    by_torque = (limit - torque) / (0.3 * limit)
-    by_lead = (config.lead_limit - lead) / (0.25 * config.lead_limit)
+    by_torque = (limit - torque) / (SOFT_TORQUE * limit)
+    by_lead = (config.lead_limit - lead) / (SOFT_LEAD * config.lead_limit)
     scaled = wanted * min(max(min(by_torque, by_lead), 0.0), 1.0)
     return min(scaled, max(rate, 0.0) + acceleration * dt)

@@ -46,6 +46,8 @@ from valve_drake.messages import (
 from valve_drake.task.modes import owned
 
 AT_VALVE = (Mode.REACH, Mode.SERVO, *owned("hybrid_rotation"))  # the wrist sensors are tared or filtered
+AT_REST = 0.02  # slower arm joints stand still, and the sensors may be tared; raise it for noisy encoders [rad/s]
+NO_TORQUE = 0.5  # below it the telemetry's share of the hands is that of their radii [N m]
 
 
 class HybridRotation(Grasping, Turning, Releasing):
@@ -95,7 +97,7 @@ class HybridRotation(Grasping, Turning, Releasing):
         raw = (state.left_wrench, state.right_wrench)
         if mode.mode == Mode.REACH:
             speeds = (*state.left_arm_velocity.tolist(), *state.right_arm_velocity.tolist())
-            if not all(abs(speed) < 0.02 for speed in speeds) or not np.isfinite(raw).all():
+            if not all(abs(speed) < AT_REST for speed in speeds) or not np.isfinite(raw).all():
                 return changed(m, tared=False) if m.tared else m
             load = np.array(
                 [raw[k] - gravity_wrench(X[k][:, :3], self.robot.hands[side]) for k, side in enumerate(SIDES)]
@@ -158,7 +160,7 @@ class HybridRotation(Grasping, Turning, Releasing):
             angle_reference=m.plan.turned + m.commanded,
             rate=m.rate,
             torque=chain.torque,
-            share_left=float(couples[0] / chain.torque) if abs(chain.torque) > 0.5 else chain.share,
+            share_left=float(couples[0] / chain.torque) if abs(chain.torque) > NO_TORQUE else chain.share,
             force_left=chain.f[0],
             force_right=chain.f[1],
             moment_left=chain.m[0],

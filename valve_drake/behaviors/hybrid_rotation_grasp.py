@@ -16,6 +16,9 @@ from valve_drake.messages import (
     Verdict,
 )
 
+HELD = 0.4  # both grippers hold for so long before the tug; raise it for fingers that bounce [s]
+MOST_PULL = 40.0  # of both hands, that the tug makes up for, at most: beyond it the hands yield again [N]
+
 
 class Grasping(Hands):
     """Mode `grasp`."""
@@ -29,7 +32,7 @@ class Grasping(Hands):
         if m.stage == "close":
             held = self._held(m, state)
             m = changed(m, held_time=m.held_time + dt if held else 0.0)
-            if m.held_time >= 0.4:
+            if m.held_time >= HELD:
                 m = changed(m, stage="tug", since=time, start=m.X)
             elif time - m.since > c.close_time:
                 m = self._fail(time, m, Verdict.GRASP_MISSED, self._openings(state))
@@ -44,7 +47,7 @@ class Grasping(Hands):
                 detail = f"tug: {pull[0]:.1f} and {pull[1]:.1f} N, {self._openings(state)}"
                 m = self._fail(time, m, Verdict.GRASP_MISSED, detail)
             else:
-                extra[3:] = c.tug_speed * chain.u + chain.u * min(float(np.sum(pull)), 40.0) / (2 * c.damping)
+                extra[3:] = c.tug_speed * chain.u + chain.u * min(float(np.sum(pull)), MOST_PULL) / (2 * c.damping)
         elif m.stage == "settle" and time - m.since > c.relax:
             if self._held(m, state):
                 status = Status(time, m.activation, "succeeded", detail=self._openings(state))

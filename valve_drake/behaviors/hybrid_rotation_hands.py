@@ -22,10 +22,11 @@ from valve_drake.messages import (
     TurnState,
     Verdict,
 )
-from valve_drake.robot.kinematics import RobotKinematics
+from valve_drake.robot.kinematics import STRIDE, RobotKinematics
 from valve_drake.valve.valve import Valve
 
 DRAWN = 0.03  # of a redundant arm's distance from its planned way, a tick: it follows that way by a quarter of a second
+PRESSES = 0.5  # share of grip_force from which a gripper presses on something; lower it for fingers that rub
 
 Pair = tuple[np.ndarray, np.ndarray]  # of both hands, left first
 
@@ -93,7 +94,7 @@ class Hands:
         c = self.config
         off = self._off(m, state)
         forces = (state.left_gripper_force, state.right_gripper_force)
-        return all(o < c.grip_margin for o in off) and all(force > 0.5 * c.grip_force for force in forces)
+        return all(o < c.grip_margin for o in off) and all(force > PRESSES * c.grip_force for force in forces)
 
     def _widths(self, m: Memory) -> tuple[float, float]:
         """Of what the hands hold [m]."""
@@ -129,7 +130,7 @@ class Hands:
         q, kept = list(m.q), list(m.X)
         for k, side in enumerate(SIDES):
             solution = self.robot.inverse(side, X[k], self._near(m, k), posture)
-            if solution is not None and np.max(np.abs(solution - m.q[k])) < 0.5:
+            if solution is not None and np.max(np.abs(solution - m.q[k])) < STRIDE:
                 q[k], kept[k] = solution, X[k]
         return changed(m, X=(kept[0], kept[1]), q=(q[0], q[1]))
 

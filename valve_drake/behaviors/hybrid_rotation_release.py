@@ -20,6 +20,8 @@ from valve_drake.messages import (
 )
 
 BRISK = 0.7  # share of a joint's speed beyond which hands are drawn back more slowly; raise it if that takes too long
+OPEN = 0.9  # share of an open gripper's opening from which a hand may be drawn back
+OPENING = 2.0  # after so long it is drawn back all the same: fingers that do not open come off with it [s]
 EASE = 1.0  # until hands that start gently are drawn back at full speed [s]
 
 
@@ -41,8 +43,8 @@ class Releasing(Hands):
                 m = changed(m, stage="open", since=time)
             return m, V, grip if closed else opened
         if m.stage == "open":
-            wide = min(state.left_gripper, state.right_gripper) > 0.9 * self.robot.opening
-            if wide or time - m.since > 2.0:
+            wide = min(state.left_gripper, state.right_gripper) > OPEN * self.robot.opening
+            if wide or time - m.since > OPENING:
                 m = changed(m, stage="retreat", since=time, start=m.X, behind=self._behind(m, state.posture))
             return m, V, opened
         if m.stage == "retreat":

@@ -25,6 +25,14 @@ from valve_drake.messages import (
 SAME_PLACE = np.radians(2)  # two stalls so near to each other are of one cause [rad]
 LOOK = 8  # ticks between two looks at the arms' margins, in which the valve turns by 0.4 deg at most; each takes 70 us
 
+STALLS = 3  # after so many, in different places, one more is a stuck valve
+TRIPPED = 3  # ticks in a row above force_trip that end the turn
+STIFF = 0.6  # share of torque_limit from which a force that trips is the valve's; below, something else is touched
+TELLING = 2.0  # torque from which it tells how the hands share it; raise it for noisy sensors [N m]
+IDLE = 0.2  # of the share that a hand should carry: with less of it, it does not hold the valve any more
+LOST = 0.5  # for so long an opening or a share is no grasp's: then it is lost [s]
+AT_LIMIT = 0.02  # arm margin at which a turn ends
+
 
 class Turning(Hands):
     """Mode `turn`."""
@@ -82,7 +90,7 @@ class Turning(Hands):
             return self._fail(time, m, Verdict.STUCK, detail)
         if m.stalls > 0 and abs(m.turned - m.stalled_at) < SAME_PLACE:
             return self._fail(time, m, Verdict.END_STOP, f"stopped twice at {here}, free the other way")
-        if m.stalls >= 3:
+        if m.stalls >= STALLS:
             return self._fail(time, m, Verdict.STUCK, f"stalled {m.stalls + 1} times")
         return changed(
             m,
@@ -100,19 +108,20 @@ class Turning(Hands):
         c: HybridRotationConfig = self.config
         force = [math.hypot(*f) for f in chain.f.tolist()]
         m = changed(m, tripped=m.tripped + 1 if max(force) > c.force_trip else 0)
-        if m.tripped >= 3:
-            verdict = Verdict.STUCK if abs(chain.torque) > 0.6 * c.torque_limit else Verdict.FAULT
+        if m.tripped >= TRIPPED:
+            verdict = Verdict.STUCK if abs(chain.torque) > STIFF * c.torque_limit else Verdict.FAULT
             return self._fail(time, m, verdict, f"hand forces {force[0]:.0f} and {force[1]:.0f} N")
         off = max(self._off(m, state)) > 2 * c.grip_margin
-        share = chain.couples[0] / chain.torque if abs(chain.torque) > 2.0 else chain.share
-        bad = off or not 0.2 * chain.share < share < 1 - 0.2 * (1 - chain.share)
+        share = chain.couples[0] / chain.torque if abs(chain.torque) > TELLING else chain.share
+        bad = off or not IDLE * chain.share < share < 1 - IDLE * (1 - chain.share)
         m = changed(m, bad_grip_time=m.bad_grip_time + dt if bad else 0.0)
-        if m.bad_grip_time > 0.5:
+        if m.bad_grip_time > LOST:
             detail = f"{self._openings(state)}, left hand carries {100 * share:.0f} %"
             return self._fail(time, m, Verdict.SLIP, detail)
-        looked = round(time / dt) % LOOK == 0
-        if looked and min(self.robot.margin(LEFT, state.left_arm), self.robot.margin(RIGHT, state.right_arm)) < 0.02:
-            return self._fail(
-                time, m, Verdict.REACH_LIMIT, f"arms at their limit at {np.degrees(m.plan.turned + m.turned):.1f} deg"
-            )
+        if round(time / dt) % LOOK:
+            return m
+        margin = min(self.robot.margin(LEFT, state.left_arm), self.robot.margin(RIGHT, state.right_arm))
+        if margin < AT_LIMIT:
+            detail = f"arms at their limit at {np.degrees(m.plan.turned + m.turned):.1f} deg"
+            return self._fail(time, m, Verdict.REACH_LIMIT, detail)
         return m

@@ -41,7 +41,9 @@ from valve_drake.messages import (
     Status,
     Verdict,
 )
-from valve_drake.robot.kinematics import RobotKinematics
+from valve_drake.robot.kinematics import STRIDE, RobotKinematics
+
+BLIND = 0.25  # without an image for so long a hand stands still; raise it for cameras slower than 4 Hz [s]
 
 
 @dc.dataclass
@@ -158,7 +160,7 @@ class ImageServo:
             )
         elif not mark.found and mark.sequence != hand.seen:
             hand = changed(hand, seen=mark.sequence, inside=0)
-        if time - hand.seen_at > 0.25:  # no image for a while: stand still
+        if time - hand.seen_at > BLIND:
             hand = changed(hand, goal=hand.X_BG[:, 3])
         step = hand.goal - hand.X_BG[:, 3]
         most = self.config.speed * dt
@@ -166,7 +168,7 @@ class ImageServo:
         p = hand.X_BG[:, 3] + step * min(1.0, most / max(length, 1e-12))
         X_BG = make(hand.X_BG[:, :3], p)
         solution = self.robot.inverse(side, X_BG, hand.q, state.posture)
-        if solution is None or np.max(np.abs(solution - hand.q)) > 0.5:
+        if solution is None or np.max(np.abs(solution - hand.q)) > STRIDE:
             return hand  # out of reach, or the wrist would turn by far: keep the command
         return changed(hand, X_BG=X_BG, q=solution)
 

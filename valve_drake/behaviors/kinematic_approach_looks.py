@@ -28,7 +28,7 @@ class Looks(Motion):
     """Modes `measure` and `verify`."""
 
     # ------------------------------------------------------------ measure
-    def _look(self, time: float, m: Memory, estimate: RectangleEstimate) -> Memory:
+    def _look(self, m: Memory, estimate: RectangleEstimate) -> Memory:
         """Gathers estimates whose images were taken after `since` + settle."""
         if (
             self.valve.seen_by(estimate)
@@ -46,7 +46,7 @@ class Looks(Motion):
             return self._plan(time, m, inputs.grasps)
         if m.phase != "look":
             return m
-        m = self._look(time, m, inputs.estimate)
+        m = self._look(m, inputs.estimate)
         if len(m.looks) < self.config.frames:
             return m
         fused = fuse(m.looks)
@@ -87,7 +87,7 @@ class Looks(Motion):
             m = self._status(changed(m, phase="look", since=time), time, "running")
         if m.phase != "look":
             return m
-        m = self._look(time, m, inputs.estimate)
+        m = self._look(m, inputs.estimate)
         newest = m.looks[-1].time if m.looks else 0.0
         m = changed(m, looks=tuple(look for look in m.looks if look.time >= newest - self.config.still_time))
         drift = self._drift(m.looks)

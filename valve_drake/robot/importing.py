@@ -107,7 +107,7 @@ def import_robot(model: str, out: Path | None = None, overwrite: bool = False, p
     if license_file is None:
         notes.append("no licence was found beside the model: ask its authors before you pass it on")
     products: dict[str, str | bytes] = {f"meshes/{key}": value for key, value in converter.files.items()}
-    products[f"{name}.urdf"] = _xml(robot, path, converter)
+    products[f"{name}.urdf"] = _xml(robot, path)
     if license_file is not None:
         products["LICENSE"] = license_file.read_bytes()
     if not keep:
@@ -452,7 +452,8 @@ def _on_the_floor(robot: Robot, boxes: dict[str, np.ndarray]) -> list[str]:
     return [f"link '{FOOTPRINT}' is added, {abs(lowest):.3f} m {way} {shown(old)}: there is the lowest shape"]
 
 
-def _xml(robot: Robot, path: Path, converter: _Converter) -> str:
+def _xml(robot: Robot, path: Path) -> str:
+    """The model as URDF; path: of the file that it is made from."""
     root = robot.element
     root.attrib = {"name": robot.name, "xmlns:drake": "http://drake.mit.edu"}
     for part in root.iter():

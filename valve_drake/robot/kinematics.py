@@ -22,6 +22,7 @@ from valve_drake.messages import LEFT, RIGHT
 
 OUTWARD: Mapping[str, float] = {LEFT: 1.0, RIGHT: -1.0}  # along y of B, away from the other arm
 TOLERANCE = 1e-6  # of a pose [rad, m]
+STRIDE = 0.5  # a joint that would move so far in one tick is on another branch: the wrist would turn by far [rad]
 LENGTH = 0.4  # of an arm's order: what a radian is worth in meters when both are compared [m]
 
 _STEP = 0.35  # of a joint in one iteration [rad]

@@ -161,7 +161,7 @@ class Robot:
         for name, turning in gaze.items():
             field = "waist_speed" if name == "waist" else "speed"
             _check_speeds(f"gaze.{field}", [turning], [getattr(d.gaze, field)])
-        self.arms = MappingProxyType({side: _arm(plant, index, d, side, joint) for side in SIDES})
+        self.arms = MappingProxyType({side: _arm(d, side, joint) for side in SIDES})
         self.home = _locked(np.concatenate([self.arms[side].home for side in SIDES]))
 
         self._plant, self._base_frame = plant, frame
@@ -657,9 +657,8 @@ def _base(plant: MultibodyPlant, index: ModelInstanceIndex, d: RobotDescription,
     return _joints(chain, [speed[0], speed[-2], speed[-1]], [0.0, 0.0, 0.0])
 
 
-def _arm(
-    plant: MultibodyPlant, index: ModelInstanceIndex, d: RobotDescription, side: str, joint: Mapping[str, Joint]
-) -> Arm:
+def _arm(d: RobotDescription, side: str, joint: Mapping[str, Joint]) -> Arm:
+    """joint: of the model, by its key in robot.yaml."""
     spec = d.arm(side)
     joints = [joint[f"arms.{side}.joints[{k}]"] for k in range(len(spec.joints))]
     work = _locked(np.array(spec.work or spec.home))
