@@ -20,8 +20,6 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # that the program ans
 _DONE, _FAILED = b"d", b"f"
 PATIENCE = 0.02  # longer waits in all than the work would have taken here are a sign of a busy machine [s]
 REST = 512  # questions that are then answered here; raise it where a busy machine stays busy
-
-
 harmless_threads = 0  # of whoever runs the program in a process of its own: they hold no lock that a copy may need
 
 

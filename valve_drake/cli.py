@@ -53,10 +53,7 @@ COMMANDS = (
     calibrate,
 )  # as --help lists them
 
-
-GARBAGE = (
-    20_000  # new objects that could be in circles before they are looked through: 700, as Python has it, finds none
-)
+GARBAGE = 20_000  # new objects until those in circles are looked for: at Python's 700 none are found, at some cost
 atexit.register(gc.freeze)  # the process's own end frees all at once: looking through every object would take 0.2 s
 
 

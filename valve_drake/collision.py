@@ -24,6 +24,7 @@ from valve_drake.robot import description, xml_file
 from valve_drake.robot.robot import Robot
 from valve_drake.valve.valve import PLATE, turned
 
+LEVEL = 0.3  # vertical part of the panel's plane, below which nothing tells how the panel lies
 FAR = np.column_stack([np.eye(3), [0.0, 0.0, -50.0]])  # out of the way: the valve's pose while none is known
 
 
@@ -33,7 +34,7 @@ def stem_angle(X_BA: np.ndarray) -> float:
     Zero where the axis is upright: nothing tells how the panel lies then.
     """
     x, y = X_BA[2, 0], X_BA[2, 1]  # heights of A's axes
-    return math.atan2(x, -y) if math.hypot(x, y) > 0.3 else 0.0
+    return math.atan2(x, -y) if math.hypot(x, y) > LEVEL else 0.0
 
 
 def srdf_pairs(path: Path) -> set[tuple[str, str]]:

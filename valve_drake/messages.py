@@ -153,7 +153,7 @@ class RobotState(Message):
         return self.torso[:-2]
 
     def head_at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Base (x, y, heading) and torso angles at `time`, interpolated -> (3,), (3,)."""
+        """Base (x, y, heading) in O [m, rad] and torso's joints at `time` [s], interpolated -> (3,), (n,)."""
         if len(self.history) == 0:
             return self.odometry[:3], self.torso
         t = self.history[:, 0]

@@ -10,6 +10,7 @@ from valve_drake.behaviors.grasp_geometry import Arc, Pair, Turn, pairs
 from valve_drake.behaviors.questions import UNITS, Enough, Questions
 
 ONE_GRASP = 2.3  # a longer turn is not tried with one grasp alone [rad]
+AS_FAR = 0.3  # of two turns that differ by less the one with the larger margin is the better [rad]
 FAR = 2.5  # a comfortable grasp that turns so far ends the search for a better one [rad]
 
 
@@ -82,6 +83,6 @@ class GraspSearch(Arcs):
 
 
 def _better(arc: Arc, best: Arc, whole: bool) -> bool:
-    if whole or abs(abs(arc.turn) - abs(best.turn)) < 0.3:
+    if whole or abs(abs(arc.turn) - abs(best.turn)) < AS_FAR:
         return arc.margin > best.margin
     return abs(arc.turn) > abs(best.turn)

@@ -17,6 +17,7 @@ from valve_drake.valve.valve import Valve, turned
 
 BEGINNINGS = 6  # of a redundant arm's search for joints without a neighbour
 OTHERS = 4  # postures that a redundant arm's way begins from, beside the first
+ENDS = 4  # of a turn that are tried for freedom from collision, the farthest first; each takes some milliseconds
 JUMP = 1.0  # a joint that moves so far between two angles of the turn is on another branch [rad]
 
 Solution = tuple[np.ndarray | None, float]  # joints and their margin
@@ -64,7 +65,7 @@ class Arcs:
             ends = list(range(reached - 1, 0, -1))
             good = [k for k in ends if margins[k] >= c.margin_good and abs(angles[k]) >= c.arc_least]
             ends = good or [k for k in ends if abs(angles[k]) >= min(c.arc_least, abs(turn.angle))]
-        for end in ends[:4]:
+        for end in ends[:ENDS]:
             arc = self._arc(turn, angles[: end + 1], grasps, {side: arms[side][0] for side in SIDES}, ask)
             margin = min(arc.margin, float(margins[end]))
             if arc.q and margin > limit:

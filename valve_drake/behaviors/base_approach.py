@@ -53,6 +53,17 @@ SLIM = 0.15  # so much nearer to an upright axis than to a panel may the base co
 STILL = np.zeros(3)
 STILL.setflags(write=False)
 NEAR = 0.03  # a holonomic base that is within the clearance by more moves away first; above a stance's noise [m]
+# A differential drive on its way to the stance; looser ones are sooner met, and leave more to the line law.
+POINTED, POINTED_RATE = 0.05, 0.2  # it points to the pre-stance, and turns no faster: it drives [rad], [rad/s]
+THERE = 0.02  # left along its way to the pre-stance: it is there [m]
+CLOSE = 0.15  # so close to the pre-stance the way to it swings round: the heading is kept [m]
+ALIGNED, ALIGNED_RATE = 0.03, 0.1  # off the stance's heading, and turning no faster: it drives in [rad], [rad/s]
+BESIDE = 1 / 5  # of the pre-stance's distance, aside there: more is a new attempt
+FUNNEL, FUNNEL_SLOPE = 2, 1 / 8  # so many pre-stances' distances before the stance, so far aside: straight in
+AT_PRE_STANCE = 0.05  # so near to it, it only has to align [m]
+RATHER_FORWARDS = 0.1  # by which the marker may be farther off the robot's front than going backwards [rad]
+LINE_END = 0.005  # left of the line: the rest is trimmed [m]
+RETREATED = 0.01  # left of the way back: it is done [m]
 RAISED = 0.01  # lift and waist are at the stance's when they are off by less [m, rad]
 
 
@@ -409,17 +420,17 @@ def _plan(
     if drive.sideways:
         return changed(m, phase="go")
     # In the funnel before the stance the line law alone brings it in.
-    if -2 * config.pre_stance < at.s < 0 and abs(at.e) < -at.s / 8 and abs(at.psi) < config.facing:
+    if -FUNNEL * config.pre_stance < at.s < 0 and abs(at.e) < -at.s * FUNNEL_SLOPE and abs(at.psi) < config.facing:
         return changed(m, phase="line")
     way = _pre_stance(config, goal) - base[:2]
-    if np.linalg.norm(way) < 0.05:
+    if np.linalg.norm(way) < AT_PRE_STANCE:
         return changed(m, phase="align")
     # The widest angle between the robot's front and the marker on the way, for driving forwards and backwards.
     lines = [marker - base[:2], marker - base[:2] - way]
     course = np.arctan2(way[1], way[0])
     angles = [abs(wrap(float(np.arctan2(line[1], line[0]) - course))) for line in lines]
     forwards, backwards = max(angles), np.pi - min(angles)
-    return changed(m, phase="turn", direction=1.0 if forwards <= backwards + 0.1 else -1.0)
+    return changed(m, phase="turn", direction=1.0 if forwards <= backwards + RATHER_FORWARDS else -1.0)
 
 
 def _course_error(m: Memory, base: np.ndarray, way: np.ndarray) -> float:
@@ -432,7 +443,7 @@ def _turn_phase(
     config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
     error = _course_error(m, base, _pre_stance(config, goal) - base[:2])
-    if abs(error) < 0.05 and abs(m.twist[2]) < 0.2:
+    if abs(error) < POINTED and abs(m.twist[2]) < POINTED_RATE:
         return changed(m, phase="drive"), STILL
     return m, _motion(rate=_turn(config, error, dt))
 
@@ -442,13 +453,13 @@ def _drive_phase(
 ) -> tuple[Memory, np.ndarray]:
     way = _pre_stance(config, goal) - base[:2]
     left = m.direction * float(way @ [np.cos(base[2]), np.sin(base[2])])
-    if left < 0.02:
+    if left < THERE:
         return changed(m, phase="align"), STILL
     error = _course_error(m, base, way)
     speed = config.fine_speed if m.direction > 0 else config.reverse_speed
-    # Close to the point its direction swings round; the heading is kept there.
-    rate = _turn(config, error, dt) if np.linalg.norm(way) > 0.15 else 0.0
-    if abs(error) > config.facing and np.linalg.norm(way) > 0.15:
+    far = np.linalg.norm(way) > CLOSE
+    rate = _turn(config, error, dt) if far else 0.0
+    if abs(error) > config.facing and far:
         return changed(m, phase="turn"), _motion(rate=rate)
     return m, _motion(m.direction * _drive(config, left, speed, dt), rate)
 
@@ -456,16 +467,16 @@ def _drive_phase(
 def _align_phase(
     config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
-    if abs(at.psi) < 0.03 and abs(m.twist[2]) < 0.1:
+    if abs(at.psi) < ALIGNED and abs(m.twist[2]) < ALIGNED_RATE:
         # Too far aside for the line law: a new attempt.
-        return changed(m, phase="line" if abs(at.e) < config.pre_stance / 5 else "plan"), STILL
+        return changed(m, phase="line" if abs(at.e) < BESIDE * config.pre_stance else "plan"), STILL
     return m, _motion(rate=_turn(config, -at.psi, dt))
 
 
 def _line_phase(
     config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
-    if at.s > -0.005:
+    if at.s > -LINE_END:
         return changed(m, phase="settle"), STILL
     psi_ref = float(-np.arctan(at.e / config.look_ahead))
     rate = float(np.clip(config.steering * wrap(psi_ref - at.psi), -config.yaw_rate, config.yaw_rate))
@@ -535,7 +546,7 @@ def _retreat(
     back = float(c * (m.start[0] - x) + s * (m.start[1] - y))
     left = config.retreat_distance - back
     m = changed(m, detail=f"{back:.2f} m back", progress=float(np.clip(back / config.retreat_distance, 0, 1)))
-    if left < 0.01 and _still(config, state):
+    if left < RETREATED and _still(config, state):
         return _end(m, "succeeded", detail=f"{back:.2f} m back")
     rate = _turn(config, wrap(float(m.start[2]) - heading), dt)
     if drive.sideways:

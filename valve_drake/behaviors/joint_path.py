@@ -14,6 +14,8 @@ Free = Callable[[np.ndarray], bool]
 STEP = 0.03  # largest joint step between two checks [rad]
 PORTION = 12  # poses checked in one portion of a search, at most; each takes 0.1 to 1 ms
 PAIRS = 11_000  # of shapes that they go through together, about
+GROWTH = 0.4  # of a tree of RRT-Connect in one try, at most [rad]
+AROUND = 0.8  # beyond start and goal that its random poses are drawn; raise it for long ways round [rad]
 LEAVE = 0.06  # poses this near to the start are not checked: the robot is there, free or not [rad]
 
 
@@ -188,15 +190,15 @@ class PathSearch:
         return self._try(VIA, k, Line(self.start, self.vias[k]), Line(self.vias[k], self.goal))
 
     def _grow(self, tried: int) -> "PathSearch":
-        """A tree grows by at most 0.4 rad towards a random pose."""
+        """A tree grows by at most GROWTH towards a random pose."""
         if tried >= self.tries:
             return dc.replace(self, done=True)
         grow = self.trees[tried % 2]
-        low, high = np.minimum(self.start, self.goal) - 0.8, np.maximum(self.start, self.goal) + 0.8
+        low, high = np.minimum(self.start, self.goal) - AROUND, np.maximum(self.start, self.goal) + AROUND
         to = np.random.Generator(np.random.SFC64(tried)).uniform(low, high)  # the same problem gives the same path
         q = grow[_nearest(grow, to)][0]
         reach = float(np.max(np.abs(to - q)))
-        return self._try(GROW, tried, Line(q, q + (to - q) * min(1.0, 0.4 / reach)))
+        return self._try(GROW, tried, Line(q, q + (to - q) * min(1.0, GROWTH / reach)))
 
     def _order(self) -> tuple[Tree, Tree]:
         """The tree that grows in this try, and the other one."""

@@ -49,6 +49,9 @@ HeadPose = Callable[[np.ndarray, np.ndarray], np.ndarray]  # base (x, y, heading
 
 # A valve that is seen so far from where it was measured may have been moved; estimates scatter by 2 mm [m].
 MOVED = 0.03
+TURNED = 0.05  # left of the base's turn between two sweeps: the next one begins [rad]
+BEHIND = 0.1  # of the neck behind the gaze: the gaze waits for it [rad]
+JOINS = 0.1  # an end of a sweep that images have come so near to has been seen [rad]
 DRIVING = tuple(mode for mode in WATCHED if TABLE[mode].base != HOLD)
 
 
@@ -481,11 +484,11 @@ def _sweep(
     end = config.sweep_yaw + config.sweep_waist
     pitch = config.pitches[max(m.sweeps, 0) // round_]
     goal = _sweep_torso(config, m.gaze, pitch)
-    if abs(m.to_turn) > 0.05:
+    if abs(m.to_turn) > TURNED:
         rate = towards(m.to_turn, config.turn_speed, config.turn_acceleration, dt)
         return changed(m, turn_rate=slew(m.turn_rate, rate, config.turn_acceleration * dt)), goal
     m = changed(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt), to_turn=0.0)
-    if np.max(np.abs(goal - m.torso)[1:]) > 0.1:  # the neck is still on its way, after a look aside or a new pitch
+    if np.max(np.abs(goal - m.torso)[1:]) > BEHIND:  # the neck is still on its way, after a look aside or a new pitch
         return m, goal
     if m.side * wrap(heading + m.gaze - m.seen_azimuth) > config.ahead:  # or a slow camera would miss what is passed
         return m, goal
@@ -493,7 +496,7 @@ def _sweep(
     m = changed(m, gaze=float(gaze))
     # It does not turn back before its images join those of the next sweep.
     unseen = m.side * wrap(heading + m.gaze - m.seen_azimuth)
-    if gaze == m.side * end and unseen <= max(end + sight.aside - np.pi / round_, 0.1):
+    if gaze == m.side * end and unseen <= max(end + sight.aside - np.pi / round_, JOINS):
         sweeps = m.sweeps + 1
         onward = m.side if sweeps % round_ % 2 else -m.side  # every turn of a round goes the same way
         turn = onward * 2 * np.pi / round_ if sweeps % round_ else 0.0
