@@ -19,7 +19,7 @@ the paper is a LeafSystem; together they are one Drake diagram:
 | 2 stages 1, 2: driving                | behaviors/base_approach.py            | base_approach        |
 | 2 stage 3: hands by kinematics        | behaviors/kinematic_approach.py       | kinematic_approach   |
 | 2 stage 4: image-based servoing       | behaviors/image_servo.py              | image_servo          |
-| 2 stage 4: hybrid control, turning    | behaviors/hybrid_rotation.py          | hybrid_rotation      |
+| 2 stage 4: hybrid control (5 here)    | behaviors/hybrid_rotation.py          | hybrid_rotation      |
 | 3 camera model, eq. (1)-(3)           | camera/lens.py                        |                      |
 | 4 visual positioning, eq. (4)-(25)    | perception/rectangle_estimator.py     | rectangle_estimator  |
 | 5.2 edges by Hough transform          | perception/line_fitting.py            | line_fitting         |

@@ -1,7 +1,7 @@
 """Stages 1 and 2 on wheels: drives the base to the stance before the valve, and away again.
 
     rough_approach  turns towards the marker's position of stage 1, drives until it is nearer than 2 m, and brakes.
-    fine_approach   by the pose of stage 2, to the stance that kinematic_approach asks for:
+    fine_approach   by the pose of stage 2, to the stance that stance_planner has found:
                         turn    to point the front or the back to the pre-stance, a point straight behind the stance
                         drive   to it, forwards or backwards, whichever keeps the marker better in view
                         align   to the stance's heading

@@ -24,7 +24,7 @@ class BaseApproachSystem(Block[BaseApproachInputs, Memory]):
     mode         in   ModeState
     position     in   StereoPosition     stage 1
     estimate     in   RectangleEstimate  stage 2
-    stance       in   Stance             where to stand, by kinematic_approach
+    stance       in   Stance             where to stand, by stance_planner
     command      out  Command            base_twist, in its modes, unless the base is fixed
     status       out  Status
 
