@@ -260,7 +260,7 @@ def step(
         m = _sight(config, m, position, estimate)
         m = _place(config, m, estimate, mode.mode in FIXED and m.result == "running")
         if mode.mode in WATCHED and m.result == "running":
-            if mode.mode in DRIVING and _out_of_reach(config, m, base, robot_state.torso, head_pose):
+            if mode.mode in DRIVING and _out_of_reach(config, m, base, robot_state.torso, head_pose, sight):
                 m = changed(m, averted=time)
             blind = time - max(m.since, m.target_time, m.averted)
             if blind > config.lost_after:
@@ -401,13 +401,13 @@ def _gaze(
 
 
 def _out_of_reach(
-    config: ValveSearchConfig, m: Memory, base: np.ndarray, torso: np.ndarray, head_pose: HeadPose
+    config: ValveSearchConfig, m: Memory, base: np.ndarray, torso: np.ndarray, head_pose: HeadPose, sight: Sight
 ) -> bool:
     """Whether neck and waist together do not turn as far as the marker."""
     if m.target is None:
         return False
     _, yaw = aim(head_pose, base, torso, m.target)
-    return abs(wrap(float(torso[0]) + yaw)) > config.yaw_limit + config.sweep_waist + VIEW
+    return abs(wrap(float(torso[0]) + yaw)) > config.yaw_limit + config.sweep_waist + sight.aside
 
 
 def _neck(config: ValveSearchConfig, pitch: float, yaw: float) -> tuple[float, float]:
