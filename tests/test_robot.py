@@ -431,6 +431,14 @@ WRONG = {
         at("grippers.left.pads", ["left_hand", "left_wrist_3"]),
         "grippers.left.joint must open and shut the pads",
     ),
+    "a pad of the other hand": (
+        at("grippers.left.pads", ["left_finger_1_link", "right_finger_1_link"]),
+        "grippers.left.pads[1] must be beyond left_arm_6, got 'right_finger_1_link'",
+    ),
+    "a lift that carries no arm": (
+        at("lift", {"joints": ["left_finger_2"], "home": [0.01], "speed": [0.02]}),
+        "lift.joints[0] must be a joint that carries both arms, got 'left_finger_2'",
+    ),
     "one pad": (at("grippers.left.pads", ["left_hand"]), "grippers.left.pads must be 2 values"),
     "a sensor that moves": (at("arms.left.sensor", "left_arm_6"), "arms.left.sensor must be a fixed joint between"),
     "the other hand's sensor": (

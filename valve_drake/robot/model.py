@@ -118,6 +118,8 @@ def add_robot(
             raise ConfigError(f"{key} must be a joint with one axis, got {shown(name)} ({joint.type_name()})")
         if not _has_actuator(plant, joint):
             plant.AddJointActuator(name, joint, efforts.get(name, EFFORT))
+    for side in SIDES:
+        _check_pads(plant, model, robot, side)
     stronger = {robot.gripper(side).joint: robot.gripper(side).effort for side in SIDES if robot.gripper(side).effort}
     for index in plant.GetJointActuatorIndices():  # those of one model are not known before the plant is finalized
         actuator = plant.get_joint_actuator(index)
@@ -131,6 +133,24 @@ def add_robot(
                 frame = frame_named(plant, model, pad.frame, f"grippers.{side}.pads[{k}]")
                 add_points(plant, frame, pad.points, robot.pad.friction)
     return model
+
+
+def _check_pads(plant: MultibodyPlant, model: ModelInstanceIndex, robot: RobotDescription, side: str) -> None:
+    """Raises ConfigError for a pad that the arm does not carry, as one of the other hand."""
+    last = robot.arm(side).joints[-1]
+
+    def carried(name: str, key: str) -> bool:
+        body = frame_named(plant, model, name, key).body()
+        while (joint := parent_joint(plant, model, body)) is not None and joint.name() != last:
+            body = joint.parent_body()
+        return joint is not None
+
+    if not carried(f"{side}_grip", f"frames.{side}_grip"):
+        return  # the arm's joints are wrong, and are told so
+    for k, pad in enumerate(robot.gripper(side).pads):
+        key = f"grippers.{side}.pads[{k}]"
+        if not carried(pad, key):
+            raise ConfigError(f"{key} must be beyond {last}, got {shown(pad)}")
 
 
 def _pad_points(robot: RobotDescription) -> dict[str, list[PadPoints]]:

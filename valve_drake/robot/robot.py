@@ -189,6 +189,7 @@ class Robot:
         self._plant.SetPositions(self._context, self._home_q)
         self._ends = [float(self._pose(chain.shoulder)[0, 3]) + chain.reach for chain in self._chains.values()]
         self._check_sides()
+        self._check_posture()
         self.gaze_signs = _locked(self._gaze_signs())
         self.grippers = MappingProxyType({side: self._gripper(side, joint[f"grippers.{side}.joint"]) for side in SIDES})
         for side in SIDES:
@@ -505,6 +506,15 @@ class Robot:
             raise ConfigError(
                 f"arms.left must be to the left of arms.right, got shoulders at y = {left:.3g} and {right:.3g} m"
             )
+
+    def _check_posture(self) -> None:
+        """What holds still while the hands work carries them: lift and waist."""
+        keys = [f"lift.joints[{k}]" for k in range(self.lift)] + ["gaze.waist"] * (self.waist is not None)
+        for key, name in zip(keys, self.posture.names):
+            for side in SIDES:
+                shoulder = self._chains[side].shoulder
+                carried = [joint.name() for joint in _carriers(self._plant, self.model.robot, shoulder)]
+                require(name in carried, key, "a joint that carries both arms", name)
 
     def _gaze_signs(self) -> np.ndarray:
         """Read off the model by how the eye's axis moves; 1 for a joint that the robot lacks."""
