@@ -139,6 +139,16 @@ def test_a_drawing_is_made_again_over_the_old_one(tmp_path, capsys):
     ]
 
 
+def test_a_list_of_somebodys_own_is_no_drawing(tmp_path, capsys):
+    mine = tmp_path / "simulated.wiring.txt"
+    mine.write_text("red wire -> pin 3\nblack wire -> ground\n")
+    assert cli.main(["draw", "--out", str(tmp_path)]) == 2
+    assert (
+        mine.read_text().startswith("red wire")
+        and "--out must be a file that does not exist" in capsys.readouterr().err
+    )
+
+
 def test_an_experiments_table_may_be_made_again_and_no_other_file(tmp_path):
     for text, own in (
         (json.dumps({"experiment": "bound"}), True),

@@ -1,5 +1,6 @@
 """The wiring of a scenario as a reviewed text list and as a drawing (SVG), both made from the built diagram."""
 
+import re
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
@@ -44,6 +45,7 @@ BEHAVIOR = "#1f5f8b"
 WIDTH, HEIGHT, COLUMN, ROW, LEFT, TOP = 158, 46, 222, 92, 24, 40
 TO_ALL = {"status": "#6a4c93", "command": "#37474f"}  # ports that every behaviour has: coloured, not labelled
 CAPTION = "One arrow for all ports between two blocks."
+_WIRE = re.compile(r"\w+\.[\w.]+ -> \w+\.[\w.]+")  # a line of the list
 BUSES = {"supervisor.mode": "#6a4c93", "robot_state.robot_state": "#546e7a", "station.health": "#c77d0a"}
 
 
@@ -60,7 +62,7 @@ def made_before(path: Path) -> bool:
         return False
     if path.suffix == ".svg":
         return CAPTION in text
-    return bool(text) and all(" -> " in line for line in text.splitlines())
+    return bool(text) and all(map(_WIRE.fullmatch, text.splitlines()))
 
 
 def write(scenario: Scenario, name: str, folder: Path) -> list[Path]:
