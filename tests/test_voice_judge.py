@@ -139,7 +139,7 @@ def test_the_second_ear_refuses_what_only_sounds_like_stop_and_alone_the_network
 @pytest.mark.parametrize(
     "levels, asked",
     [
-        ([-25, -24, -29, -30, -33], [6, 7, 8, 9]),  # grows quieter by 6 dB, ends, and one step after
+        ([-25, -24, -25, -26, -33], [6, 7, 8, 9]),  # grows quieter by 2 dB, ends, and one step after
         ([-25, -25], [5, 6]),
         ([-25], [4, 5]),
         ([-25] * 12, [15, 16]),
@@ -168,7 +168,7 @@ def test_a_stop_is_heard_whose_soft_end_hides_it_before_nobody_speaks():
             self.liked = " Stop." if 4 <= self.now <= 7 else None
             return super().look(back, seconds)
 
-    tail = [-30, -26, -25, -28, -36, -38, -39, -40, -40]
+    tail = [-30, -26, -25, -26, -36, -38, -39, -40, -40]
     assert [k for k, each in heard(silence(16), Fades(" Stop."), tail) if each.score >= SURE] == [7]
 
 

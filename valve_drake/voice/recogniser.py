@@ -64,7 +64,7 @@ STOP_LIKELY = -2.25  # their sum from which it is one; lower: fewer are missed, 
 # It is asked too, whatever the network says, wherever a short burst of speech grows quieter: most words are loudest
 # before their end, and what follows, a breath, an echo or noise, soon hides from the second ear what they were.
 BURST = 12  # steps of such a burst, at most; higher: fewer `stop` within longer speech are missed, more asking
-FALLEN = 6.0  # below its loudest step [dB]; lower: asked more often, and a word is noticed sooner
+FALLEN = 2.0  # below its loudest step [dB]; lower: asked more often, and in the middle of words
 STOP_BACK, STOP_FILLED = 1.0, 3.0  # of sound that it is asked about, and to which silence fills it up [s]
 _EARLY = 0.1  # probability of `confirm` from which it is asked whether the sentence is no more than that
 
