@@ -295,17 +295,18 @@ def _head(scenario: Scenario) -> StereoHead:
 
 
 def _check_seen(scenario: Scenario, head: StereoHead, robot: Robot) -> None:
-    """Raises ConfigError for a marker that is too small to be seen from the nearest place of a search."""
-    start, size = scenario.simulation.start, scenario.valve.marker.size
-    nearest = robot.stand[0]
-    if scenario.station == "simulated" and not start.at_valve:
-        nearest = start.distance.min if isinstance(start.distance, Uniform) else start.distance
+    """Raises ConfigError for a marker that is too small to be seen from anywhere that a search may look from.
+
+    Whether one is seen from where a run starts, that run tells: the place is drawn.
+    """
+    size, nearest = scenario.valve.marker.size, robot.stand[0] if robot.drive.fixed else DRIVING_START
     least = scenario.color_segmentation.min_area
     area = size[0] * size[1] * (head.left.focal() / nearest) ** 2
     grow = math.sqrt(least / area)
+    enough = ", ".join(f"{math.ceil(1e3 * grow * side) / 1e3:g}" for side in size)
     words = (
-        f"at least [{grow * size[0]:.3f}, {grow * size[1]:.3f}]: {nearest:.3g} m away, the nearest place of a "
-        f"search, it has {area:.1f} px^2, and color_segmentation.min_area is {least:g}"
+        f"at least [{enough}]: {nearest:.3g} m away, the nearest place of a search, it has {area:.1f} px^2, and "
+        f"color_segmentation.min_area is {least:g}"
     )
     require(grow <= 1.0, "valve.marker.size", words, size)
 
