@@ -3,6 +3,7 @@
 import json
 import shutil
 import time
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
@@ -169,6 +170,23 @@ def test_a_valve_that_no_hand_can_hold_is_said_once_and_nothing_is_reached_for(t
     assert len(missing) == 1 and missing[0].startswith("grasp : valve.handles[0].xyz must be at least 0.1")
     assert not report.reach
     assert "valve.handles[0].xyz" in robot_check_page.page(report)
+
+
+@pytest.mark.system
+def test_a_shape_that_is_larger_than_its_link_is_named_where_it_keeps_the_hands_off_the_valve(tmp_path):
+    """As a capsule of a wrist that reaches to the finger tips: the arms would get there."""
+
+    def sleeve(model):
+        for side in ("left", "right"):
+            shape = """<collision name="sleeve"><pose>0.2 0 0 0 0 0</pose><geometry><box>
+                <size>0.4 0.03 0.03</size></box></geometry></collision>"""
+            part(model, "link", f"{side}_wrist_2").append(ElementTree.fromstring(shape))
+
+    ignore = at("collision", {"ignore": "touching_at_home"})  # the sleeve is about the hand's own shapes
+    lines = said(checked(variant(tmp_path, sleeve, ignore)), MISSING)
+    words = "reach collision: links in the way are all that keeps it from 1 m, mostly "
+    (line,) = [line for line in lines if line.startswith(words)]
+    assert "wheel" in line and line.endswith(": smaller shapes of that link in the model")
 
 
 def test_a_wrong_file_is_bad_input(tmp_path, capsys):
