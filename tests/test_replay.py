@@ -203,7 +203,7 @@ def test_a_changed_gain_is_found_at_the_first_command_that_it_changes(path, log,
 
 
 def test_another_image_threshold_is_found_in_the_first_image(path, log, capsys):
-    assert cli.main(["replay", str(path), "--set", "color_segmentation.min_area=20000"]) == 0
+    assert cli.main(["replay", str(path), "--set", "color_segmentation.min_area=12000"]) == 0
     out = capsys.readouterr().out
     looked = next(t for _, t, p in log.messages(["/color_segmentation/segmentation"]) if p.sequence >= 0)
     assert f"different from t = {looked:.4f} s: /color_segmentation/segmentation left.candidates" in out
