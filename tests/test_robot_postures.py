@@ -47,6 +47,7 @@ def margin(stances):
     return with_robot
 
 
+@pytest.mark.system
 def test_working_postures_turn_the_valve_for_which_they_were_found(robot, monkeypatch):
     monkeypatch.setattr(robot_postures, "BEGINNINGS", 30)
     monkeypatch.setattr(robot_postures, "PLACES", 3)
@@ -60,6 +61,7 @@ def test_working_postures_turn_the_valve_for_which_they_were_found(robot, monkey
     assert robot_postures.find_work(stances, valves, QUARTER, 1.0, margin(stances)) is None, "none is that good"
 
 
+@pytest.mark.system
 def test_a_home_is_before_the_shoulders_and_below_them_and_free(robot, monkeypatch):
     monkeypatch.setattr(robot_postures, "HOMES", 25)
     work = {side: robot.arms[side].work.tolist() for side in SIDES}
