@@ -20,8 +20,8 @@ if sys.argv[2] == "alone":
 elif sys.argv[2] in halves.BESIDE | {"base_approach"}:  # a block that makes something else than when it was recorded
     from valve_drake import ports
     update = ports.Block.update
-    def other(self, work, time, *rest):
-        done = update(self, work, time, *rest)
+    def other(self, time, *rest):
+        done = update(self, time, *rest)
         if self.get_name() == sys.argv[2] and time > 1.5 and done:
             import dataclasses
             done = done[0], {port: dataclasses.replace(value, time=value.time + 1) for port, value in done[1].items()}

@@ -83,7 +83,7 @@ def test_a_home_is_before_the_shoulders_and_below_them_and_free(robot, monkeypat
 
 @pytest.mark.system
 def test_check_robot_tells_postures_where_those_of_the_file_do_not_serve(robot):
-    scenario, report = scenarios.load(None, []), Report("", "", "")
+    scenario, report = scenarios.load(None, []), Report("", "")
     report.reach.append(Reach(1.0, 0.0, -1.0))
     report.hidden = {"left": 0.0}
     robot_check._postures(report, robot, scenario, CollisionModel(robot))
@@ -95,7 +95,7 @@ def test_check_robot_tells_postures_where_those_of_the_file_do_not_serve(robot):
 
 def test_check_robot_tells_none_where_those_of_the_file_serve():
     ours = Robot.load("models/robot/robot.yaml")
-    report = Report("", "", "")
+    report = Report("", "")
     report.reach.append(Reach(1.0, 0.0, 0.9))
     report.hidden = {"left": 0.0}
     robot_check._postures(report, ours, scenarios.load(None, []), CollisionModel(ours))
