@@ -12,7 +12,7 @@ end.
 
 Where the packages of judge.py are installed, a second ear is asked: at a sentence's end, which words it heard, and how
 likely the likeliest sentences are in their sound; at a word that may be `stop`, and wherever a short burst of speech
-grows quieter, whether it was `stop`. Without them the network decides.
+grows quieter, whether it was `stop`: that counts if the burst ends then. Without them the network decides.
 """
 
 import dataclasses as dc
@@ -62,9 +62,11 @@ STOP_CERTAIN = 0.99  # lower: fewer are missed, more are heard in other words
 STOP_HEARD = 0.5  # share of the ln of the odds that the second ear heard the word, beside that it would write it
 STOP_LIKELY = -2.25  # their sum from which it is one; lower: fewer are missed, more are heard in other words
 # It is asked too, whatever the network says, wherever a short burst of speech grows quieter: most words are loudest
-# before their end, and what follows, a breath, an echo or noise, soon hides from the second ear what they were.
+# before their end, and what follows, a breath, an echo or noise, soon hides from the second ear what they were. The
+# beginning of a longer sentence sounds like it as well ("ope..."), so the answer counts when the burst has ended.
 BURST = 12  # steps of such a burst, at most; higher: fewer `stop` within longer speech are missed, more asking
 FALLEN = 2.0  # below its loudest step [dB]; lower: asked more often, and in the middle of words
+RECENT = 5  # steps whose answers count then; higher: words with a longer soft end are heard, and more is that is none
 STOP_BACK, STOP_FILLED = 1.0, 3.0  # of sound that it is asked about, and to which silence fills it up [s]
 _EARLY = 0.1  # probability of `confirm` from which it is asked whether the sentence is no more than that
 
@@ -238,12 +240,8 @@ def _sentence(words: np.ndarray, heard: str, second: SecondEar | None, back: flo
     return text if probability >= needed else heard, score(probability, needed)
 
 
-def _stop(probability: float, falls: bool, second: SecondEar | None) -> float:
-    """How sure it is that `stop` has just been said, as a score. probability: the network's. falls: a burst does."""
-    if second is None or probability >= STOP_CERTAIN:
-        return score(probability, STOP_SURE)
-    if probability < STOP_MAYBE and not falls:
-        return 0.0
+def _stop(second: SecondEar) -> float:
+    """How sure the second ear is that `stop` has just been said, as a score."""
     look = second.look(STOP_BACK, STOP_FILLED)
     found = float(look.likelihoods([*judges.written("stop"), *judges.written(f"{grammar.WAKE} stop")]).max())
     heard = float(np.clip(look.words[:, INDEX["stop"]].max(), 0.5, 1 - 1e-6))  # it may speak for it, never against it
@@ -266,15 +264,17 @@ class Memory:
     """time: steps so far. said: the probabilities since the sentence began, oldest first; empty: nobody speaks.
 
     burst: levels of the steps in which somebody has spoken without a pause [dB]. ended: a burst of BURST steps at most
-    has, one step ago. quiet: steps since somebody spoke. wordless: since the last word, within the sentence. since: the
-    step before which all sound belongs to what was heard already. before: the probabilities of the last step. deaf:
-    steps for which `stop` and `confirm` are not heard again.
+    has, one step ago. asked: how sure the second ear was of `stop` in its last RECENT steps. quiet: steps since
+    somebody spoke. wordless: since the last word, within the sentence. since: the step before which all sound belongs
+    to what was heard already. before: the probabilities of the last step. deaf: steps for which `stop` and `confirm`
+    are not heard again.
     """
 
     time: int = 0
     said: tuple[np.ndarray, ...] = ()
     burst: tuple[float, ...] = ()
     ended: bool = False
+    asked: tuple[float, ...] = ()
     quiet: int = 0
     wordless: int = 0
     since: int = 0
@@ -301,6 +301,8 @@ def step(
     burst = () if level is None else (*m.burst, level)[-BURST - 1 :]
     ended = level is None and 0 < len(m.burst) <= BURST
     falls = 0 < len(burst) <= BURST and burst[-1] <= max(burst) - FALLEN
+    over = level is None and m.ended
+    asked = m.asked if len(burst) != 1 else ()
     end = (time - quiet) * STEP
     begin = (time - max(len(said), 1)) * STEP
 
@@ -308,10 +310,16 @@ def step(
         return float(1 - (1 - p[INDEX[word]]) * (1 - before[INDEX[word]]))
 
     out: list[Heard] = []
-    stop = _stop(spike("stop"), (falls or ended or m.ended) and not deaf_stop, second)
+    sure, stop = spike("stop"), 0.0
+    if second is None or sure >= STOP_CERTAIN:
+        stop = score(sure, STOP_SURE)
+    elif not deaf_stop:
+        answer = _stop(second) if sure >= STOP_MAYBE or falls or ended or over else 0.0
+        asked = (*asked, answer)[-RECENT:]
+        stop = max(asked) if over else answer if sure >= STOP_MAYBE else 0.0
     if stop >= SURE:
         out.append(Heard("stop", stop, begin, time * STEP))
-        said, quiet, since, deaf_stop, p = (), 0, time, DEAF, _without(p, ["stop"])
+        said, quiet, since, deaf_stop, asked, p = (), 0, time, DEAF, (), _without(p, ["stop"])
     elif spike("confirm") > _EARLY and said:
         text, probability = best_sentence(np.stack(said), _confirms())
         if probability >= CONFIRM_SURE:
@@ -325,7 +333,8 @@ def step(
             out.append(Heard(*_sentence(words, heard, second, back), begin, end))
             since = time - PAUSE // 2
         said, quiet = (), 0
-    return Memory(time, said, burst, ended, quiet, wordless, since, p, (deaf_stop, deaf_confirm)), tuple(out)
+    deaf = deaf_stop, deaf_confirm
+    return Memory(time, said, burst, ended, asked, quiet, wordless, since, p, deaf), tuple(out)
 
 
 # ---------------------------------------------------------------- the whole, on a stream
