@@ -147,6 +147,7 @@ def test_logs_are_kept_as_asked(tmp_path, fake, keep, kept):
     assert len(list((tmp_path / "out/logs").glob("*.mcap"))) == kept
 
 
+@pytest.mark.system
 def test_a_crash_and_a_time_out_are_failures_with_their_reason(tmp_path, fake):
     start = time.monotonic()
     crash, late = run(wanted(tmp_path / "out", 2, 13, time_out=2.0))
@@ -181,6 +182,7 @@ def test_records_are_equal_but_for_their_times(tmp_path, fake):
     assert [r | {"times": 0} for r in a] == [r | {"times": 0} for r in b]
 
 
+@pytest.mark.system
 def test_jobs_run_at_the_same_time(tmp_path, fake, monkeypatch):
     monkeypatch.setenv("TAKES", "1")
     start = time.monotonic()

@@ -90,6 +90,7 @@ def test_each_topic_is_made_by_one_half():
     assert set(halves.JOINED_FROM) == set(JOINED)
 
 
+@pytest.mark.system
 def test_work_that_fails_or_is_lost_is_a_difference():
     code = """
 import os, signal, sys

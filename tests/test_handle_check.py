@@ -3,6 +3,7 @@
 import dataclasses as dc
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -32,18 +33,23 @@ def made(radius: float, kind: str = "bar", count: int = 2, **changes) -> Valve:
     return dc.replace(VALVE, model="", handles=[HandleConfig(kind=kind, xyz=xyz) for xyz in places], **changes)
 
 
-def test_handles_beside_the_markers_plate_are_refused_with_the_least_radius_which_will_do():
+def least_told(refusal: str, make: Callable[[float], Valve], value: float) -> None:
+    """A valve made with `value` is refused, by a line that tells the least one which will do: it does, and no less."""
     with pytest.raises(ConfigError) as error:
-        check(made(0.06))
-    said = re.fullmatch(
-        r"valve\.handles\[0\]\.xyz must be at least (0\.1\d+) m off the axis: an open hand there touches the valve "
-        r"\(face\) or is nearer than collision.padding, got \[0.06, 0.0, 0.0\]",
-        str(error.value),
-    )
+        check(make(value))
+    said = re.fullmatch(refusal, str(error.value))
     assert said, error.value
-    check(made(float(said[1])))
-    with pytest.raises(ConfigError, match="at least"):
-        check(made(float(said[1]) - 0.003))
+    check(make(float(said[1])))
+    with pytest.raises(ConfigError, match="must be at least"):
+        check(make(float(said[1]) - 0.003))
+
+
+def test_handles_beside_the_markers_plate_are_refused_with_the_least_radius_which_will_do():
+    refusal = (
+        r"valve\.handles\[0\]\.xyz must be at least (0\.1\d+) m off the axis: an open hand there touches the valve "
+        r"\(face\) or is nearer than collision.padding, got \[0.06, 0.0, 0.0\]"
+    )
+    least_told(refusal, made, 0.06)
 
 
 def test_a_wheel_whose_spokes_are_where_hands_would_be_is_refused_by_its_spokes():
@@ -56,20 +62,11 @@ def test_a_wheel_whose_spokes_are_where_hands_would_be_is_refused_by_its_spokes(
 
 
 def test_a_panel_that_hands_touch_is_refused_with_the_least_depth_which_will_do():
-    def near(depth: float) -> Valve:
-        return made(0.15, panel=PanelConfig(depth=depth))
-
-    with pytest.raises(ConfigError) as error:
-        check(near(0.025))
-    said = re.fullmatch(
+    refusal = (
         r"valve\.panel\.depth must be at least (0\.0\d+): an open hand at valve\.handles\[0\] touches the panel or is "
-        r"nearer than collision\.padding, got 0\.025",
-        str(error.value),
+        r"nearer than collision\.padding, got 0\.025"
     )
-    assert said, error.value
-    check(near(float(said[1])))
-    with pytest.raises(ConfigError, match="valve.panel.depth must be at least"):
-        check(near(float(said[1]) - 0.003))
+    least_told(refusal, lambda depth: made(0.15, panel=PanelConfig(depth=depth)), 0.025)
 
 
 def test_fingers_that_do_not_go_round_a_handle_are_the_robots_fault(tmp_path):

@@ -317,6 +317,7 @@ def test_bad_input_gives_one_line_and_exit_code_2(arguments, words, capsys):
     assert err.count("\n") == 1 and err.startswith("valve-drake: ") and words in err
 
 
+@pytest.mark.system
 def test_run_json_prints_one_object(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     quick = [word for key in QUICK for word in ("--set", key)]

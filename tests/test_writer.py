@@ -138,6 +138,7 @@ def test_a_place_that_cannot_be_written_is_one_clear_line(tmp_path):
         LogWriter(tmp_path / "file" / "a.mcap")
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("seconds", [0.3, 1.9, 3.1])
 def test_kill_9_loses_at_most_a_second(tmp_path, seconds):
     child, now = start_child(tmp_path / "a.mcap", seconds)
