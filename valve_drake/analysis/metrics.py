@@ -72,7 +72,7 @@ class Summary:
     reason: str = ""
     spans: list[ModeSpan] = dc.field(default_factory=list)
     sim_time_s: float = 0.0
-    retries: int = 0  # entries into a mode that had been entered before
+    retries: int = 0  # entries into a mode that had been entered before, with the same grasp
     command_rad: float | None = None
     angle_hands_rad: float | None = None
     angle_camera_rad: float | None = None
