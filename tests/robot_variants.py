@@ -95,6 +95,29 @@ def fixed(given: dict[str, Any]) -> None:
     given["base"] |= {"drive": "fixed", "speed": [], "acceleration": []}
 
 
+def stiff_neck(model: Model, pitch: float, waist: bool = True) -> None:
+    """A head that does not turn and looks down by `pitch` [rad]; without a waist too if asked for."""
+    for name in ("neck_pitch", "neck_yaw", *([] if waist else ["waist"])):
+        joint = part(model, "joint", name)
+        joint.set("type", "fixed")
+        for element in [element for element in joint if element.tag in ("axis", "dynamics")]:
+            joint.remove(element)
+    pose = part(model, "link", part(model, "joint", "neck_pitch").findtext("child") or "").find("pose")
+    assert pose is not None
+    x, y, z, roll, _, yaw = (pose.text or "").split()
+    pose.text = f"{x} {y} {z} {roll} {pitch} {yaw}"
+
+
+def without_gaze(given: dict[str, Any]) -> None:
+    """Of that model with its waist; `without_waist` of that without."""
+    del given["gaze"]["pan"], given["gaze"]["tilt"]
+
+
+def without_waist(given: dict[str, Any]) -> None:
+    without_gaze(given)
+    del given["gaze"]["waist"]
+
+
 def without_force_sensors(given: dict[str, Any]) -> None:
     """Forces by the joints' torques, which a gear's sensor reads to a tenth of a newton meter."""
     for side in SIDES:

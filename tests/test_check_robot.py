@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from robot_facts import ROBOT
-from robot_variants import fixed, part, put, variant, without_base_joints
+from robot_variants import fixed, part, put, stiff_neck, variant, without_base_joints, without_gaze
 
 from valve_drake import cli, robot_check, robot_check_page, yaml_file
 from valve_drake import scenario as scenarios
@@ -96,7 +96,7 @@ def off_the_hand(model):
 LACKS = {
     "no second eye": (None, at("head_calibration", ""), MISSING, "search head_calibration: none: there is no"),
     "a calibration that is not there": (None, at("head_calibration", "h.yaml"), MISSING, "head_calibration: no such"),
-    "no tilt": (None, at("gaze.tilt", ""), MISSING, "search gaze.tilt: no joint turns the eyes up and down"),
+    "no tilt": (None, at("gaze.tilt", ""), DOUBTFUL, "search gaze: neck_pitch moves the eyes and is not named: give"),
     "no wrist camera": (None, at("cameras.right_wrist", ""), MISSING, "servo cameras.right_wrist: no camera"),
     "a camera on the forearm": (off_the_hand, None, MISSING, "left_wrist: left_forearm does not move with the hand"),
     "nothing taught": (None, at("taught", ""), NOTE, "servo taught: none yet"),
@@ -151,6 +151,19 @@ def test_what_a_robot_lacks_is_said_with_its_key(case, tmp_path, monkeypatch):
     assert any(words in line for line in said(report, level)), report.findings
     assert report.usable == (level != MISSING)
     assert all("\n" not in line for line in robot_check_page.lines(report))
+
+
+@pytest.mark.system
+def test_a_head_that_does_not_turn_sees_valves_of_some_heights_from_the_stance(tmp_path):
+    path = variant(tmp_path, lambda model: stiff_neck(model, 0.6), without_gaze)
+    report = checked(path, "simulation.valve.height=!Uniform {min: 0.9, max: 1.3}")
+    upright = {row.height: row for row in report.reach if row.tilt == 0}
+    assert upright[1.0].seen_to < 2 and np.isnan(upright[0.8].seen_to) and np.isnan(upright[1.3].seen_to)
+    assert any("gaze.tilt: the eyes do not see the whole marker" in line for line in said(report, DOUBTFUL))
+    low = checked(path, "simulation.valve.height=0.75")
+    assert any("at 0.75" in line and "from where its hands reach it" in line for line in said(low, MISSING))
+    ours = checked("robot/robot.yaml")
+    assert all(row.seen_to == 4.0 for row in ours.reach) and not said(ours, DOUBTFUL)
 
 
 @pytest.mark.system
@@ -219,7 +232,7 @@ REAL = {
     "baxter": (
         BAXTER,
         [
-            (MISSING, "search gaze.tilt: no joint turns the eyes up and down"),
+            (NOTE, "search gaze.tilt: none: the head does not turn, the search looks at one height"),
             (NOTE, "approach base.drive: fixed"),
             (DOUBTFUL, "grasp opening: the fingers open by 42 mm"),
             (MISSING, "grasp : opening must be wider, or frames."),

@@ -10,7 +10,18 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from robot_facts import MIRROR, ROBOT, robot_state
-from robot_variants import fixed, part, put, seven_joints, variant, with_roll, without_base_joints
+from robot_variants import (
+    fixed,
+    part,
+    put,
+    seven_joints,
+    stiff_neck,
+    variant,
+    with_roll,
+    without_base_joints,
+    without_gaze,
+    without_waist,
+)
 
 from valve_drake import cli, named_files, resources, yaml_file
 from valve_drake.checks import ConfigError
@@ -22,6 +33,7 @@ from valve_drake.robot import description, model
 from valve_drake.robot.robot import Gripper, Robot
 from valve_drake.scenario import load, resolve
 from valve_drake.stations.contract import check_contract, vectors
+from valve_drake.stations.lcm_channels import COMMANDS, REPORTS, present
 
 OURS = description.find(description.OURS)
 PR2 = "pr2/pr2.robot.yaml"
@@ -509,7 +521,6 @@ USELESS = {
         [],
         "arms.left.home and arms.right.home must be free of all: left_",
     ),
-    "no tilt": ([at("gaze.tilt", "")], [], "gaze.tilt must be given: the search turns the eyes by it"),
     "hands too small for the valve": ([at("opening", 0.03)], [], "opening must be at least 0.055: valve.handles.width"),
     "a handle that open fingers are too near to": (
         [],
@@ -589,6 +600,52 @@ def test_a_gaze_is_planned_within_the_robots_joints(tmp_path, joint, upper, key,
     assert getattr(used.config, key) == pytest.approx(clipped)
     with pytest.raises(ConfigError, match=rf"valve_search\.{key} must be within what the robot's joint can do"):
         make_blocks(load(None, [f"robot={path}", f"valve_search.{key}={chosen}"]))
+
+
+def test_a_head_that_does_not_turn_looks_where_it_is_mounted(tmp_path):
+    """One line for each joint that there is not, whatever is configured; a value that was chosen is refused."""
+    path = variant(tmp_path, lambda model: stiff_neck(model, 0.4), without_gaze)
+    scenario = load(None, [f"robot={path}"])
+    robot = Robot.load(path)
+    assert robot.gaze == (0, None, None) and robot.torso.names == ("waist",) and robot.groups.absent == ()
+    assert robot.held(np.array([0.3])).tolist() == [0.3]
+    search, lines = gaze_of(scenario)
+    assert (search.pitches, search.pitch_high, search.yaw_limit, search.sweep_yaw) == ([0.0], 0.0, 0.0, 0.0)
+    assert search.sweep_waist == scenario.valve_search.sweep_waist
+    assert [line.split(":")[0] for line in lines] == ["gaze.tilt", "gaze.pan"]
+    make_blocks(scenario)
+    with pytest.raises(ConfigError, match=r"pitches must be within what the robot's joint can do, \[0, 0\]"):
+        make_blocks(load(None, [f"robot={path}", "valve_search.pitches=[0.1]"]))
+
+
+def test_eyes_that_nothing_turns_aside_have_to_look_ahead(tmp_path):
+    def aside(model):
+        stiff_neck(model, 0.4)
+        pose = part(model, "link", "head").find("pose")
+        pose.text = pose.text.rsplit(maxsplit=1)[0] + " 0.2"
+
+    with pytest.raises(ConfigError, match="gaze.pan must be a joint, or the left eye has to look ahead .* 0.20 rad l"):
+        Robot.load(variant(tmp_path, aside, without_gaze))
+
+
+def test_a_torso_without_joints_is_a_device_that_the_robot_does_not_have(tmp_path):
+    def edit(model):
+        without_base_joints(model)
+        stiff_neck(model, 0.6, waist=False)
+
+    path = variant(tmp_path, edit, lambda given: (fixed(given), without_waist(given)))
+    robot = Robot.load(path)
+    assert robot.groups.absent == ("base", "torso") and robot.held(np.zeros(0)).shape == (0,)
+    assert not any(row.key.startswith(("torso.", "base.")) for row in present(COMMANDS + REPORTS, robot.groups))
+    start = "simulation.start={distance: 0.77, bearing: 0, heading: 0}"
+    scenario = resolve(load(None, [f"robot={path}", start, "simulation.valve.height=1.0"]))
+    diagram = make_diagram(scenario).diagram
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.05)
+    station = make_station(scenario)
+    context = station.CreateDefaultContext()
+    assert station.GetOutputPort("torso.position_measured").Eval(context).shape == (0,)
+    assert "torso" not in station.GetOutputPort("health").Eval(context).devices
 
 
 def test_our_own_robot_looks_as_configured():

@@ -9,6 +9,7 @@ import signal
 import socket
 
 import pytest
+from robot_variants import fixed, stiff_neck, variant, without_base_joints, without_waist
 
 from valve_drake import cli, runner
 from valve_drake import scenario as scenarios
@@ -346,6 +347,20 @@ def test_the_whole_work_turns_the_valve(tmp_path):
     assert s.angle_camera_rad == pytest.approx(s.angle_true_rad, abs=0.01)
     assert s.turn_peak_hand_force_N < 35 and 0.4 < s.turn_share_left < 0.6
     assert html.stat().st_size > 1e6 and LogReader(tmp_path / "whole.mcap").damage == []
+
+
+@pytest.mark.slow
+def test_a_robot_whose_head_waist_and_base_do_not_move_turns_the_valve_before_it(tmp_path):
+    def edit(model):
+        without_base_joints(model)
+        stiff_neck(model, 0.6, waist=False)
+
+    robot = variant(tmp_path / "robot", edit, lambda given: (fixed(given), without_waist(given)))
+    before = "simulation.start={distance: 0.77, bearing: 0, heading: 0}"
+    result = run(tmp_path / "stiff.mcap", ["seed=3", f"robot={robot}", before, "simulation.valve.height=1.0"])
+    s = result.summary
+    assert (s.outcome, s.verdict, s.retries) == ("done", "turned", 0)
+    assert s.angle_true_rad == pytest.approx(s.command_rad, abs=0.035)
 
 
 @pytest.mark.slow

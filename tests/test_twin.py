@@ -16,6 +16,7 @@ from bad_messages import bad_messages, on
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from robot_facts import SIZES
+from robot_variants import fixed, variant, without_base_joints
 
 from valve_drake import diagram, rehearsal, runner
 from valve_drake import scenario as scenarios
@@ -183,6 +184,20 @@ def test_a_stuck_joint_that_the_robot_does_not_have_gives_one_line():
     scenario = scenarios.load("hardware.scenario.yaml", ["faults=[{kind: stuck, device: torso, joint: 3}]"])
     with pytest.raises(ConfigError, match=r"^faults\[0\]\.joint must be within \[0, 2\], got 3$"):
         rehearsal.make_twin(scenarios.resolve(scenario))
+
+
+def test_a_fault_of_a_device_that_the_robot_does_not_have_gives_one_line(tmp_path):
+    path = variant(tmp_path, without_base_joints, fixed)
+    scenario = scenarios.load("hardware.scenario.yaml", [f"robot={path}", "faults=[{kind: dead, device: base}]"])
+    with pytest.raises(ConfigError, match=r"^faults\[0\]\.device must be one that the robot has, got 'base'$"):
+        rehearsal.make_twin(scenarios.resolve(scenario))
+
+
+def test_a_torso_without_joints_is_neither_late_nor_faster_than_it_may_move():
+    none = {f"torso.position_{what}": np.zeros(0) for what in ("command", "measured")}
+    guard = Guard(START | {"torso.position_command": np.zeros(0)}, 0.1, SPEED | {"torso": np.zeros(0)})
+    targets = guard.targets(MEASURED | none, False, 0.0)
+    assert targets["torso.position_command"].shape == (0,) and guard.faults(0.0) == []
 
 
 def test_a_fault_begins_with_its_mode_and_lasts_for_its_duration():

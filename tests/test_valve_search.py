@@ -148,6 +148,40 @@ def test_a_fixed_robot_that_sees_nothing_says_so_within_the_modes_deadline():
     assert np.max(torsos[:, 1]) > CONFIG.pitch_high - 0.25  # it has looked down, too
 
 
+STIFF = dc.replace(
+    CONFIG, sweep_yaw=0.0, yaw_limit=0.0, sweep_waist=0.0, pitch_low=0.0, pitch_high=0.0, pitches=[0.0]
+)  # a head that does not turn
+
+
+@pytest.mark.parametrize("bearing", [-2.8, -1.5, -0.1, 0.7, 3.1])
+def test_a_head_that_does_not_turn_is_turned_by_the_base_and_leaves_no_direction_out(bearing):
+    p_OV = around(bearing, 3.0, 1.1)
+    world = World(p_OV, np.random.default_rng(3), torso=np.zeros(3))
+    status, time, torsos, memory = search(world, config=STIFF)
+    assert status.state == "succeeded", status.detail
+    assert np.linalg.norm(memory.target - p_OV) < 0.1 and time < 40
+    assert not torsos.any()
+
+
+def test_a_head_that_does_not_turn_has_looked_all_round_before_it_gives_up():
+    world = World(None, np.random.default_rng(3), torso=np.zeros(3))
+    status, time, _, _ = search(world, config=STIFF)
+    assert status.verdict == "not_found" and status.detail == "no marker in 16 sweeps all round" and time < 50
+    assert abs(world.base[2]) == pytest.approx(15 / 16 * 2 * np.pi, abs=0.06)  # what one turn leaves, the next makes up
+
+
+@pytest.mark.parametrize("late", [0.03, 0.6])
+def test_a_fixed_head_on_a_fixed_base_waits_for_images_and_looks_at_several(late):
+    p_OV = around(0.0, 1.2, 1.2)
+    config = bolted(STIFF)
+    world = World(p_OV, np.random.default_rng(3), torso=np.zeros(3), late=late)
+    status, _, _, memory = search(world, config=config, base=FIXED)
+    assert status.state == "succeeded" and np.linalg.norm(memory.target - p_OV) < 0.02
+    world = World(None, np.random.default_rng(3), torso=np.zeros(3), late=late)
+    status, time, _, _ = search(world, config=config, base=FIXED)
+    assert status.verdict == "not_found" and time > (CONFIG.confirm_looks - 1) * max(late, 1 / 8)
+
+
 def around(bearing: float, distance: float, height: float) -> np.ndarray:
     return np.array([distance * np.cos(bearing), distance * np.sin(bearing), height])
 
@@ -485,13 +519,13 @@ def test_a_marker_that_a_stiff_neck_cannot_face_is_not_lost_while_the_base_drive
 def rig(**inputs) -> Rig:
     robot = robot_state(time=0.0)
     return Rig(
-        ValveSearchSystem(CONFIG, HEAD, np.zeros(3), 0),
+        ValveSearchSystem(CONFIG, HEAD, np.zeros(3), (0, 1, 2)),
         **{"robot_state": robot, "mode": ModeState(mode="search", activation=1)} | inputs,
     )
 
 
 def test_ports():
-    assert ports(ValveSearchSystem(CONFIG, HEAD, np.zeros(3), 0)) == {
+    assert ports(ValveSearchSystem(CONFIG, HEAD, np.zeros(3), (0, 1, 2))) == {
         "robot_state": "in abstract",
         "mode": "in abstract",
         "position": "in abstract",
@@ -500,6 +534,31 @@ def test_ports():
         "command": "out abstract",
         "status": "out abstract",
     }
+
+
+@pytest.mark.parametrize(
+    ("rest", "gaze"), [([0.3], (None, None, None)), ([0.3, 0.1], (None, 1, None)), ([0.3, 0.2, 0.1], (1, None, 2))]
+)
+def test_joints_that_a_head_lacks_are_not_commanded_and_count_as_zero(rest, gaze):
+    rest = np.array(rest)
+
+    def head(base, torso):
+        assert torso.shape == rest.shape
+        return HEAD(base, np.array([0.0 if joint is None else torso[joint] for joint in gaze]))
+
+    block = ValveSearchSystem(CONFIG, head, rest, gaze)
+    seen = block._seen(robot_state(torso=rest)).torso
+    assert seen.tolist() == [0.0 if joint is None else rest[joint] for joint in gaze]
+    dut = Rig(
+        block,
+        robot_state=robot_state(torso=rest, history=np.zeros((1, 4 + len(rest)))),
+        mode=ModeState(mode="measure", activation=2),
+        position=StereoPosition(0.1, 1, True, np.array([0.3, 0.2, 2.0]), 1e-6 * np.eye(3), HEAD(np.zeros(3), seen)),
+    )
+    torso = dut.run(1.0).read("command").torso
+    assert torso.shape == rest.shape and torso[0] == 0.3
+    for joint in gaze[1:]:
+        assert joint is None or abs(torso[joint] - rest[joint]) > 0.02
 
 
 @pytest.mark.parametrize(("rest", "waist"), [([0.3, 0.1, 0.0], None), ([0.3, 0.0, 0.1, 0.0], 1)])
@@ -513,7 +572,7 @@ def test_a_lift_stays_where_it_rests_and_a_robot_without_a_waist_turns_its_head_
         return HEAD(base, np.array([0.0 if waist is None else torso[waist], *torso[-2:]]))
 
     dut = Rig(
-        ValveSearchSystem(CONFIG, head, rest, waist),
+        ValveSearchSystem(CONFIG, head, rest, (waist, len(rest) - 2, len(rest) - 1)),
         robot_state=robot_state(torso=rest, history=np.zeros((1, 4 + len(rest)))),
         mode=ModeState(mode="search", activation=1),
     )
@@ -553,7 +612,7 @@ def test_block_refuses_a_wrong_message_and_needs_the_mode():
     with pytest.raises(TypeError, match="want StereoPosition"):
         rig(position=RectangleEstimate()).run(0.1)
     with pytest.raises(RuntimeError, match="mode.*valve_search.*nothing is connected"):
-        Rig(ValveSearchSystem(CONFIG, HEAD, np.zeros(3), 0), robot_state=robot_state()).run(0.1)
+        Rig(ValveSearchSystem(CONFIG, HEAD, np.zeros(3), (0, 1, 2)), robot_state=robot_state()).run(0.1)
 
 
 @pytest.mark.parametrize(
@@ -569,4 +628,4 @@ def test_block_refuses_a_wrong_message_and_needs_the_mode():
 )
 def test_bad_config_is_refused_by_name(changes, words):
     with pytest.raises(ConfigError, match=words):
-        ValveSearchSystem(ValveSearchConfig(**changes), HEAD, np.zeros(3), 0)
+        ValveSearchSystem(ValveSearchConfig(**changes), HEAD, np.zeros(3), (0, 1, 2))

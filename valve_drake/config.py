@@ -248,6 +248,8 @@ def _build(given: Any, kind: Any, default: Any, key: str, source: str, unknown: 
             if not isinstance(given.tree, dict) or not {"min", "max"} <= set(given.tree):
                 raise _wrong(given.tree, f"{UNIFORM} {{min: a, max: b}}", key, source)
             return _build(given.tree, Uniform, None, key, source, unknown)
+        if not isinstance(given, (int, float)):
+            raise _wrong(given, f"a finite number or {UNIFORM} {{min: a, max: b}}", key, source)
         kind = float
     return _scalar(given, kind, key, source)
 

@@ -170,8 +170,6 @@ def robot_of(scenario: Scenario) -> Robot:
         words = "given for station hardware" if over_wire else "given, or servo: none"
         for side in SIDES if over_wire or d.servo == "camera" else ():
             require(bool(d.cameras[f"{side}_wrist"]), f"cameras.{side}_wrist", words, d.cameras[f"{side}_wrist"])
-        for key in ("pan", "tilt"):
-            require(bool(getattr(d.gaze, key)), f"gaze.{key}", "given: the search turns the eyes by it", "")
         _gaze(scenario.valve_search, robot)
         high, width = scenario.command_selector.gripper_high, max(h.width for h in scenario.valve.handles)
         require(d.opening <= high, "opening", f"at most command_selector.gripper_high, {high:g}", d.opening)
@@ -201,15 +199,14 @@ def gaze_of(scenario: Scenario) -> tuple[ValveSearchConfig, list[str]]:
 
 
 def _gaze(search: ValveSearchConfig, robot: Robot) -> tuple[ValveSearchConfig, list[str]]:
-    limits = dict(zip(robot.torso.names, zip(robot.torso.low.tolist(), robot.torso.high.tolist())))
-    low, high = limits[robot.torso.names[-2]]
-    pitch = (low, high) if robot.gaze_signs[1] > 0 else (-high, -low)
+    limits = list(zip(robot.torso.low.tolist(), robot.torso.high.tolist()))
+    waist, tilt, pan = (None if joint is None else limits[joint] for joint in robot.gaze)
 
-    def both(joint: str) -> float:
-        return max(min(-limits[joint][0], limits[joint][1]), 0.0)
+    def both(limit: tuple[float, float]) -> float:
+        return max(min(-limit[0], limit[1]), 0.0)
 
-    waist = None if robot.waist is None else both(robot.torso.names[robot.waist])
-    return reachable(search, GazeLimits(pitch, both(robot.torso.names[-1]), waist))
+    pitch = tilt if tilt is None or robot.gaze_signs[1] > 0 else (-tilt[1], -tilt[0])
+    return reachable(search, GazeLimits(pitch, pan and both(pan), waist and both(waist)))
 
 
 def start_of(scenario: Scenario) -> RobotStart | None:
@@ -353,7 +350,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
             _gaze(scenario.valve_search, robot)[0],
             lambda base, torso: compose(robot.head_pose(base, torso), X_LEyes),
             robot.torso.home,
-            robot.waist,
+            robot.gaze,
             robot.gaze_signs,
             look=valve.look(),
             drive=robot.drive,

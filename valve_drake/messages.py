@@ -127,7 +127,7 @@ class RobotState(Message):
     time: float = 0.0
     # x, y [m], heading [rad], then the speeds that the base has: forward, sideways [m/s], yaw rate [rad/s]
     odometry: np.ndarray = _shared(np.zeros(5), (-1,))
-    torso: np.ndarray = array(-1)  # lift and waist, if there are; tilt, pan [m, rad]
+    torso: np.ndarray = array(-1)  # lift, waist, tilt, pan, as far as there are [m, rad]
     left_arm: np.ndarray = array(-1)  # [rad]
     right_arm: np.ndarray = array(-1)
     left_arm_velocity: np.ndarray = array(-1)  # [rad/s]
@@ -146,11 +146,6 @@ class RobotState(Message):
     def twist(self) -> np.ndarray:
         """The base's speeds, as many as it has."""
         return self.odometry[3:]
-
-    @property
-    def posture(self) -> np.ndarray:
-        """Lift and waist, as far as there are -> (n,); empty before they were measured."""
-        return self.torso[:-2]
 
     def head_at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Base (x, y, heading) in O [m, rad] and torso's joints at `time` [s], interpolated -> (3,), (n,)."""

@@ -63,6 +63,7 @@ def make_twin(
     """The twin of a resolved scenario. workers: make its images; LiveImages, and their rate, to keep real time."""
     robot = robot_of(dc.replace(scenario, station="hardware"))  # the program at the other end takes no others
     for k, fault in enumerate(scenario.faults):
+        require(fault.device not in robot.groups.absent, f"faults[{k}].device", "one that the robot has", fault.device)
         if fault.kind == "stuck":
             last = robot.groups.size(fault.device) - 1
             require(fault.joint <= last, f"faults[{k}].joint", f"within [0, {last}]", fault.joint)

@@ -29,7 +29,7 @@ from valve_drake.checks import ConfigError
 from valve_drake.collision import CollisionModel
 from valve_drake.config import Uniform
 from valve_drake.diagram import gaze_of, robot_of
-from valve_drake.frames import compose, inverse, planar
+from valve_drake.frames import apply, compose, inverse, planar
 from valve_drake.messages import SIDES
 from valve_drake.robot import description as descriptions
 from valve_drake.robot.kinematics import Joints
@@ -37,6 +37,7 @@ from valve_drake.robot.model import add_robot, parent_joint
 from valve_drake.robot.portrait import Studio, png
 from valve_drake.robot.robot import Robot
 from valve_drake.robot_postures import Postures, find_home, find_work
+from valve_drake.robot_sight import seen_from
 from valve_drake.scenario import Scenario
 from valve_drake.stations.scene import add_scene, panel_pose
 from valve_drake.stations.servos import add_servos
@@ -65,6 +66,7 @@ OUTER = 3  # arm joints from the shoulder on whose links may touch the trunk at 
 FIELD = 1.0  # upright, of an eye whose lens is not known [rad]
 EYE = 320, 240  # of an eye's picture [px]
 BEHIND = np.array([-0.75, 0.65, 0.35]), np.array([-0.45, -0.75, 0.6])  # views of a robot at the valve
+COMES = 2.0  # base to panel where the fine approach begins [m]
 SAMPLES = 7  # of the turn at which efforts are looked at
 NIGHT = (1.0, 0.0, 1.0)  # a sky in a colour that no robot has
 
@@ -96,6 +98,7 @@ class Reach:
     posture: tuple[float, ...] = ()  # lift and waist
     effort: float = math.nan  # largest share of a joint's limit
     joint: str = ""  # whose that is
+    seen_to: float = math.nan  # the head sees the valve from there, and as far back as this [m]; NaN: not from there
 
     def serves(self, least: float) -> bool:
         return self.margin >= least and not self.effort > DEAR
@@ -125,6 +128,7 @@ class Report:
     reach: list[Reach] = dc.field(default_factory=list)
     least_margin: float = 0.0
     friction: float = 0.0  # of the valve for which efforts are given [N m]
+    has_head: bool = False  # its calibration is there
     hidden: dict[str, float] = dc.field(default_factory=dict)  # by eye, share of its image's middle
     pictures: dict[str, bytes] = dc.field(default_factory=dict)
     seconds: float = 0.0  # of processor time
@@ -177,6 +181,7 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
         report.seconds = time.process_time() - start
         return report
     _groups(report, robot)
+    report.has_head = _head_of(scenario) is not None
     _head(report, robot, scenario)
     _base(report, robot)
     collision = CollisionModel(robot)
@@ -289,9 +294,9 @@ def _links(robot: Robot, side: str) -> dict[str, int]:
 
 def _head(report: Report, robot: Robot, scenario: Scenario) -> None:
     d = robot.description
-    for key, words in (("pan", "to the left and right"), ("tilt", "up and down")):
-        if not getattr(d.gaze, key):
-            report.add(MISSING, "search", f"gaze.{key}", f"no joint turns the eyes {words}: the search needs one")
+    for name in _unnamed(robot):
+        text = f"{name} moves the eyes and is not named: give it as waist, pan or tilt, or hold it fast (weld)"
+        report.add(DOUBTFUL, "search", "gaze", text)
     with contextlib.suppress(ConfigError):  # what a run refuses comes last
         for line in gaze_of(scenario)[1]:
             report.add(NOTE, "search", "", line)
@@ -303,6 +308,18 @@ def _head(report: Report, robot: Robot, scenario: Scenario) -> None:
         _calibration(scenario)
     except ConfigError as error:
         report.add(MISSING, "search", "head_calibration", str(error))
+
+
+def _unnamed(robot: Robot) -> list[str]:
+    """Joints that carry the left eye and move, and that robot.yaml does not name."""
+    plant, index = robot.model.plant, robot.model.robot
+    named = {*robot.base.names, *robot.torso.names, *(mimic.joint for mimic in robot.model.mimics)}
+    body, out = plant.GetFrameByName(robot.description.cameras["head_left"], index).body(), []
+    while (joint := parent_joint(plant, index, body)) is not None:
+        if joint.num_velocities() and joint.name() not in named:
+            out.append(joint.name())
+        body = joint.parent_body()
+    return out
 
 
 def _calibration(scenario: Scenario) -> StereoHead:
@@ -471,13 +488,30 @@ def _reach(report: Report, robot: Robot, scenario: Scenario, collision: Collisio
         effort, joint = _effort(report, robot, stances, X_BA, place)
         distance = float(np.linalg.norm(place.base[:2]))
         posture = () if place.posture is None else tuple(round(float(q), 4) for q in place.posture)
-        report.reach.append(Reach(height, tilt, margin, distance, posture, effort, joint))
+        seen_to = _seen_to(robot, scenario, X_WA, place)
+        report.reach.append(Reach(height, tilt, margin, distance, posture, effort, joint, seen_to))
         if tilt == 0 and (best is None or margin > best[0]):
             best = margin, valve, place
-    _judge_reach(report, spec, own)
+    _judge_reach(report, spec, own, not robot.drive.fixed)
     if best is None or best[0] < spec.margin_min:
         _in_the_way(report, stances, collision)
     return None if best is None else best[1:]
+
+
+def _seen_to(robot: Robot, scenario: Scenario, X_WA: np.ndarray, place: Place) -> float:
+    """How far back from a stance the head sees the whole marker, before the turn and after it [m]; NaN: not there."""
+    head = _head_of(scenario)
+    if head is None:
+        return math.nan
+    valve = scenario.valve
+    ends = [X_WA] if valve.fixed else [X_WA, turned(X_WA, TURN)]
+    points = np.concatenate([apply(compose(X, valve.X_AV()), valve.target().corners()) for X in ends])
+    try:
+        search = gaze_of(scenario)[0]
+    except ConfigError:  # what a run refuses comes last
+        search = scenario.valve_search
+    posture = robot.posture.home if place.posture is None else place.posture
+    return seen_from(robot, head, search, place.base, posture, points)
 
 
 def _in_the_way(report: Report, stances: Stances, collision: CollisionModel) -> None:
@@ -528,7 +562,7 @@ def _views(scenario: Scenario) -> Mapping[str, np.ndarray]:
         return dict.fromkeys(SIDES, np.array([0.0, 0.0, 1.0]))
 
 
-def _judge_reach(report: Report, spec: StanceConfig, own: set[float]) -> None:
+def _judge_reach(report: Report, spec: StanceConfig, own: set[float], drives: bool) -> None:
     upright = [row for row in report.reach if row.tilt == 0]
     good = [row for row in upright if row.serves(spec.margin_min)]
     weak = [row for row in upright if row.margin >= spec.margin_min and row.effort > DEAR]
@@ -542,6 +576,7 @@ def _judge_reach(report: Report, spec: StanceConfig, own: set[float]) -> None:
         report.add(MISSING, "reach", "arms.*.work", text)
         return
     served = {round(row.height, 3) for row in good}
+    _judge_sight(report, good, own, drives)
     out = [row.height for row in upright if round(row.height, 3) not in served]
     if lost := sorted(own - served):
         # One height: that is the valve of this scenario. Several: it is drawn, and most may be in reach.
@@ -549,6 +584,22 @@ def _judge_reach(report: Report, spec: StanceConfig, own: set[float]) -> None:
         report.add(MISSING if len(lost) == len(own) else DOUBTFUL, "reach", "", text)
     elif out:
         report.add(NOTE, "reach", "", f"valves at {', '.join(f'{h:g}' for h in out)} m are out of reach")
+
+
+def _judge_sight(report: Report, good: list[Reach], own: set[float], drives: bool) -> None:
+    """Whether the head sees the valves that the hands reach: from the stance, and on the way there."""
+    if not report.has_head:
+        return
+    key = "gaze.tilt"
+    blind = [row for row in good if math.isnan(row.seen_to)]
+    late = [row for row in good if row.seen_to < COMES if drives]
+    for rows, where in (blind, "from where its hands reach it"), (late, f"from there back to {COMES:g} m"):
+        if not rows:
+            continue
+        heights = sorted({row.height for row in rows})
+        text = f"the eyes do not see the whole marker of a valve at {', '.join(f'{h:g}' for h in heights)} m {where}"
+        mine = own & {round(height, 3) for height in heights}
+        report.add(MISSING if mine == own else DOUBTFUL if mine else NOTE, "search", key, text)
 
 
 def _effort(report: Report, robot: Robot, stances: Stances, X_BA: np.ndarray, place: Place) -> tuple[float, str]:

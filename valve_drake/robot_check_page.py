@@ -81,6 +81,7 @@ def _reach_head(report: Report) -> tuple[str, ...]:
         "tilt [deg]",
         "margin",
         "distance [m]",
+        "seen to [m]",
         "lift, waist",
         f"effort at {report.friction:g} N m",
         "of",
@@ -90,10 +91,11 @@ def _reach_head(report: Report) -> tuple[str, ...]:
 def _reach_row(row: Reach) -> tuple[str, ...]:
     place = f"{row.height:g}", f"{math.degrees(row.tilt):.0f}"
     if row.margin < 0:
-        return (*place, "-", "out of reach", "", "", "")
+        return (*place, "-", "out of reach", "", "", "", "")
     effort = "" if math.isnan(row.effort) else f"{row.effort:.2f}"
     posture = ", ".join(f"{q:g}" for q in row.posture) or "home"
-    return (*place, f"{row.margin:.2f}", f"{row.distance:.2f}", posture, effort, row.joint)
+    seen = "not seen" if math.isnan(row.seen_to) else f"{row.seen_to:.2f}"
+    return (*place, f"{row.margin:.2f}", f"{row.distance:.2f}", seen, posture, effort, row.joint)
 
 
 # ---------------------------------------------------------------- page

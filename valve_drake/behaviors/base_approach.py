@@ -530,7 +530,8 @@ def _settle(
 
 def _rises(m: Memory, state: RobotState) -> bool:
     """Whether lift or waist is still on its way to the stance's."""
-    return len(m.posture) == len(state.posture) and bool(np.any(np.abs(m.posture - state.posture) > RAISED))
+    there = state.torso[: len(m.posture)]
+    return len(there) == len(m.posture) and bool(np.any(np.abs(m.posture - there) > RAISED))
 
 
 # ---------------------------------------------------------------- retreat

@@ -100,7 +100,7 @@ class BlindServo:
     def _begin(self, state: RobotState, side: str) -> Hand:
         q = state.left_arm if side == LEFT else state.right_arm
         wrench = state.left_wrench if side == LEFT else state.right_wrench
-        return Hand(self.robot.forward(side, q, state.posture), q, wrench[3:])
+        return Hand(self.robot.forward(side, q, self.robot.held(state.torso)), q, wrench[3:])
 
     def _hand(self, dt: float, hand: Hand, state: RobotState, side: str, goal: np.ndarray) -> Hand:
         c = self.config
@@ -113,7 +113,7 @@ class BlindServo:
         if hand.stopped or left < 1e-9:
             return hand
         X_BG = make(hand.X_BG[:, :3], hand.X_BG[:, 3] + step * min(1.0, c.speed * dt / left))
-        q = self.robot.inverse(side, X_BG, hand.q, state.posture)
+        q = self.robot.inverse(side, X_BG, hand.q, self.robot.held(state.torso))
         if q is None or np.max(np.abs(q - hand.q)) > STRIDE:
             return hand  # out of reach, or the wrist would turn by far: keep the command
         return changed(hand, X_BG=X_BG, q=q)

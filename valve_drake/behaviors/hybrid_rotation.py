@@ -61,7 +61,8 @@ class HybridRotation(Grasping, Turning, Releasing):
             idle = memory if memory.activation < 0 else changed(memory, activation=-1, status=Status())
             return idle, Command(time=time)
         q = (state.left_arm, state.right_arm)
-        X = (self.robot.forward(LEFT, q[0], state.posture), self.robot.forward(RIGHT, q[1], state.posture))
+        posture = self.robot.held(state.torso)
+        X = (self.robot.forward(LEFT, q[0], posture), self.robot.forward(RIGHT, q[1], posture))
         m = self._sense(dt, memory, state, mode, X)
         if mode.mode in (Mode.REACH, Mode.SERVO):  # other blocks move the hands
             return changed(m, activation=-1, status=Status(), commanding=False), Command(time=time)
@@ -79,7 +80,7 @@ class HybridRotation(Grasping, Turning, Releasing):
         run = {Mode.GRASP: self._grasp, Mode.TURN: self._turn, Mode.RELEASE: self._release}[Mode(mode.mode)]
         m, V, gripper = run(time, dt, m, state, mode, chain)
         V = V if sound else np.zeros((2, 6))
-        m = self._move(dt, m, V, chain, state.posture)
+        m = self._move(dt, m, V, chain, posture)
         m = changed(m, telemetry=self._telemetry(time, m, chain))
         command = Command(time=time, left_arm=m.q[0], right_arm=m.q[1], left_gripper=gripper, right_gripper=gripper)
         return m, command

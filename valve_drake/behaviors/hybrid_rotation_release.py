@@ -45,7 +45,9 @@ class Releasing(Hands):
         if m.stage == "open":
             wide = min(state.left_gripper, state.right_gripper) > OPEN * self.robot.opening
             if wide or time - m.since > OPENING:
-                m = changed(m, stage="retreat", since=time, start=m.X, behind=self._behind(m, state.posture))
+                m = changed(
+                    m, stage="retreat", since=time, start=m.X, behind=self._behind(m, self.robot.held(state.torso))
+                )
             return m, V, opened
         if m.stage == "retreat":
             m = self._draw_back(time, dt, m, state)
@@ -78,7 +80,7 @@ class Releasing(Hands):
         """Both hands `way` from where they let go [m]."""
         way = min(way, self.config.retreat)
         left, right = (standoff(m.start[k], self.view[side], way) for k, side in enumerate(SIDES))
-        return self._command(changed(m, back=way / self.config.retreat), (left, right), state.posture)
+        return self._command(changed(m, back=way / self.config.retreat), (left, right), self.robot.held(state.torso))
 
     def _haste(self, dt: float, before: Memory, after: Memory) -> float:
         """How fast the fastest joint has to be between two commands, as a share of what is allowed."""

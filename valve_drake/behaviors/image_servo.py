@@ -135,12 +135,12 @@ class ImageServo:
 
     def _begin(self, time: float, state: RobotState, side: str) -> Hand:
         q = state.left_arm if side == LEFT else state.right_arm
-        X_BG = self.robot.forward(side, q, state.posture)
+        X_BG = self.robot.forward(side, q, self.robot.held(state.torso))
         return Hand(X_BG=X_BG, start=X_BG[:, 3], goal=X_BG[:, 3], q=q, seen_at=time)
 
     def _hand(self, time: float, dt: float, hand: Hand, state: RobotState, side: str, mark: HandleMark) -> Hand:
         q = state.left_arm if side == LEFT else state.right_arm
-        p_now = self.robot.forward(side, q, state.posture)[:, 3]
+        p_now = self.robot.forward(side, q, self.robot.held(state.torso))[:, 3]
         # A constant servo error would bias the hand: it is compensated.
         droop = hand.X_BG[:, 3] - p_now
         droop = droop * min(1.0, self.config.max_droop / max(float(np.linalg.norm(droop)), 1e-12))
@@ -167,7 +167,7 @@ class ImageServo:
         length = float(np.linalg.norm(step))
         p = hand.X_BG[:, 3] + step * min(1.0, most / max(length, 1e-12))
         X_BG = make(hand.X_BG[:, :3], p)
-        solution = self.robot.inverse(side, X_BG, hand.q, state.posture)
+        solution = self.robot.inverse(side, X_BG, hand.q, self.robot.held(state.torso))
         if solution is None or np.max(np.abs(solution - hand.q)) > STRIDE:
             return hand  # out of reach, or the wrist would turn by far: keep the command
         return changed(hand, X_BG=X_BG, q=solution)

@@ -52,7 +52,7 @@ class Looks(Motion):
         fused = fuse(m.looks)
         if not fused.found:
             return self._status(changed(m, phase="end"), time, "failed", Verdict.MARKER_LOST, fused.reason)
-        past = inputs.state.history[:, 4:-2]
+        past = self.robot.held(inputs.state.history[:, 4:])
         if past.size and not np.max(np.ptp(past, axis=0)) <= STILL:
             return m  # lift or waist is on its way
         X_OA = self.valve.place(fused.X_OV, fused.angle)
@@ -66,7 +66,9 @@ class Looks(Motion):
         first = X_OA if m.X_OA0 is None else m.X_OA0
         m = changed(m, phase="planning", X_OA0=first, X_OA=X_OA, counted=counted, covariance=fused.covariance)
         m = changed(m, p_OV=fused.X_OV[:, 3], plan=GraspPlan())  # what the hands did by it is counted
-        return self._ask(m, "grasps", X_BA, posture=inputs.state.posture, turn_angle=inputs.mode.turn_angle - counted)
+        return self._ask(
+            m, "grasps", X_BA, posture=self.robot.held(inputs.state.torso), turn_angle=inputs.mode.turn_angle - counted
+        )
 
     def _plan(self, time: float, m: Memory, grasps: GraspPlan) -> Memory:
         """Takes the grasps that were asked for."""

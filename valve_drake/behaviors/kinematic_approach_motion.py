@@ -148,7 +148,7 @@ class Motion:
         X_BA: of a valve to keep clear of; read in phase "start" alone.
         """
         if m.phase == "start":
-            m = self._move(time, m, self.home, X_BA, inputs.state.posture)
+            m = self._move(time, m, self.home, X_BA, self.robot.held(inputs.state.torso))
         m = self._follow(time, m, inputs.path)
         if m.phase == "moving" and (m.path is None or time >= m.path.end()):
             m = changed(m, phase="home", since=time)

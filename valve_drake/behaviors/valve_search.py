@@ -9,7 +9,8 @@ Owns the torso (waist twist, neck pitch, neck yaw) in every mode but the final o
              distance, else the sweep goes on. Fails with not_found after the last round.
              The gaze waits for images, so that a slow camera makes the search slower and not blind.
              A fixed base does not turn: then a round is one sweep, and the rounds go on downwards as far as the head
-             does, since a valve that such a robot can reach is near (`bolted`).
+             does, since a valve that such a robot can reach is near (`bolted`). A head that does not turn sees as far
+             as its images: the base turns it, by so much between two looks, or it looks again.
     others   The neck keeps the last known p_OV on the optical axis of the left camera, the waist comes back to zero;
              only while driving it helps when the neck is at its end.
              Without a sighting for `lost_after` while driving or measuring: failed with marker_lost; while it drives
@@ -60,7 +61,7 @@ class ValveSearchConfig(Config):
     """Scenario key `valve_search`."""
 
     KEY = "valve_search"
-    sweep_yaw: float = number(1.4, 0.1, 1.6, "neck yaw at the ends of a sweep [rad]")
+    sweep_yaw: float = number(1.4, 0.0, 1.6, "neck yaw at the ends of a sweep [rad]")
     sweep_waist: float = number(0.5, 0.0, 0.6, "waist twist there [rad]")
     sweep_speed: float = number(1.0, 0.05, 3.0, "of the gaze [rad/s]")
     pitches: list[float] = numbers([0.15, 0.4, -0.05], -0.5, 1.1, "neck pitch of each round [rad]", count=(1, 20))
@@ -86,13 +87,13 @@ class ValveSearchConfig(Config):
     neck_speed: float = number(1.5, 0.1, 3.0, "[rad/s]")
     waist_speed: float = number(0.4, 0.05, 1.5, "[rad/s]")
     acceleration: float = number(5.0, 0.2, 20.0, "of waist and neck [rad/s^2]")
-    yaw_limit: float = number(1.55, 0.1, 1.6, "of the neck, to both sides [rad]")
+    yaw_limit: float = number(1.55, 0.0, 1.6, "of the neck, to both sides [rad]")
     pitch_low: float = number(-0.45, -0.5, 1.1, "of the neck [rad]")
     pitch_high: float = number(1.05, -0.5, 1.1, "of the neck [rad]")
 
     def relations(self, key: str) -> None:
         low, high = self.pitch_low, self.pitch_high
-        require(low < high, f"{key}.pitch_low", f"below pitch_high, {high:g}", low)
+        require(low <= high, f"{key}.pitch_low", f"at most pitch_high, {high:g}", low)
         within = all(low <= pitch <= high for pitch in self.pitches)
         require(within, f"{key}.pitches", f"within pitch_low and pitch_high, [{low:g}, {high:g}]", self.pitches)
         within = self.sweep_yaw <= self.yaw_limit
@@ -103,11 +104,11 @@ class ValveSearchConfig(Config):
 class GazeLimits:
     """What a robot's joints can do: pitches are downwards, pan and waist go as far to both sides [rad].
 
-    waist: None for a robot without one.
+    None: there is no such joint.
     """
 
-    pitch: tuple[float, float]
-    pan: float
+    pitch: tuple[float, float] | None
+    pan: float | None
     waist: float | None
 
 
@@ -134,14 +135,19 @@ def reachable(config: ValveSearchConfig, limits: GazeLimits) -> tuple[ValveSearc
     """The gaze as this robot's joints can do it, and a line for every value that is not as configured.
 
     A default is clipped; a value that was chosen is refused, by a ConfigError that names the key. A value that equals
-    the default counts as one.
+    the default counts as one. A head without a tilt or a pan looks along its mount: one line says so.
     """
     default, fitted, notes = ValveSearchConfig(), copy.deepcopy(config), []
-    asked = [("pitch_low", limits.pitch), ("pitch_high", limits.pitch), ("pitches", limits.pitch)]
-    asked += [("yaw_limit", (0.0, limits.pan)), ("sweep_yaw", (0.0, limits.pan))]
-    if limits.waist is not None:
-        asked.append(("sweep_waist", (0.0, limits.waist)))
-    for name, (low, high) in asked:
+    for joint, limit, turn in ("tilt", limits.pitch, "looks at one height"), ("pan", limits.pan, "looks ahead"):
+        if limit is None:
+            notes.append(f"gaze.{joint}: none: the head does not turn, the search {turn}")
+    tilt, pan, waist = (limits.pitch is not None, limits.pan is not None, limits.waist is not None)
+    pitch, yaw = limits.pitch or (0.0, 0.0), (0.0, limits.pan or 0.0)
+    asked = [("pitch_low", pitch, tilt), ("pitch_high", pitch, tilt), ("pitches", pitch, tilt)]
+    asked += [("yaw_limit", yaw, pan), ("sweep_yaw", yaw, pan)]
+    if waist:
+        asked.append(("sweep_waist", (0.0, limits.waist or 0.0), True))
+    for name, (low, high), told in asked:
         value = getattr(config, name)
         values = value if isinstance(value, list) else [value]
         clipped = [_within(one, low, high) for one in values]
@@ -149,9 +155,10 @@ def reachable(config: ValveSearchConfig, limits: GazeLimits) -> tuple[ValveSearc
             continue
         words = f"within what the robot's joint can do, [{low:g}, {high:g}]"
         require(value == getattr(default, name), f"{config.KEY}.{name}", words, value)
-        new = clipped if isinstance(value, list) else clipped[0]
+        new = list(dict.fromkeys(clipped)) if isinstance(value, list) else clipped[0]  # no round twice
         setattr(fitted, name, new)
-        notes.append(f"{config.KEY}.{name}: {_said(new)} instead of {_said(value)}: what the robot's joint can do")
+        if told:
+            notes.append(f"{config.KEY}.{name}: {_said(new)} instead of {_said(value)}: what the robot's joint can do")
     return fitted, notes
 
 
@@ -190,6 +197,7 @@ class Memory:
     side: float = 1.0  # the end it is moving to
     gaze: float = 0.0  # waist + neck yaw asked for [rad]
     to_turn: float = 0.0  # left of the base's turn between two sweeps, positive to the left [rad]
+    owed: float = 0.0  # by which the last turn of this round fell short, added to the next [rad]
     heading: float = 0.0  # of the base at the previous step [rad]
     turn_rate: float = 0.0  # commanded [rad/s]
     looks: tuple[tuple[np.ndarray, float], ...] = ()  # p_OV [m] and its sigma [m], of the last sightings
@@ -197,6 +205,7 @@ class Memory:
     confirm_left: int = 0  # pairs of images that a sighting may still be confirmed by
     seen_time: float = -np.inf  # capture time of the newest pair of images, whatever it shows [s]
     seen_azimuth: float = 0.0  # of the left camera's axis then, in O [rad]
+    seen: int = 0  # pairs of images in this sweep
     ignore_until: float = -np.inf  # capture time [s]
 
 
@@ -323,7 +332,10 @@ def bolted(config: ValveSearchConfig, sight: Sight = USUAL) -> ValveSearchConfig
     steeper = np.arange(max(config.pitches) + sight.lower, config.pitch_high, sight.lower).tolist()
     first = [pitch for pitch in sorted(config.pitches) if pitch >= config.pitches[0]]
     rest = [pitch for pitch in config.pitches if pitch not in first]
-    return dc.replace(config, pitches=[*first, *steeper, *rest])
+    pitches = [*first, *steeper, *rest]
+    if len(pitches) == 1 and config.sweep_yaw + config.sweep_waist == 0.0:  # nothing turns: it looks again, and waits
+        pitches *= config.confirm_looks
+    return dc.replace(config, pitches=pitches)
 
 
 def _sweeps(config: ValveSearchConfig, drive: Drive, sight: Sight) -> int:
@@ -438,7 +450,11 @@ def _search(
 ) -> tuple[Memory, np.ndarray]:
     """One tick of the search -> memory, torso goal. sweeps: of a round; between two the base turns."""
     turned = wrap(float(base[2]) - m.heading)
-    m = changed(m, heading=float(base[2]), to_turn=m.to_turn - turned if m.to_turn else 0.0)
+    m = changed(m, heading=float(base[2]))
+    if m.to_turn:
+        m = changed(m, to_turn=m.to_turn - turned)
+    elif m.owed:
+        m = changed(m, owed=m.owed - turned)
     if m.result == "running":
         m = _look(config, m, time, position)
     confirming = bool(m.looks) and (time < m.confirm_until or m.confirm_left > 0)
@@ -458,7 +474,7 @@ def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPos
     if position.time > m.seen_time:
         axis = position.X_OL[:, 2]
         azimuth, left = float(np.arctan2(axis[1], axis[0])), max(m.confirm_left - 1, 0)
-        m = changed(m, seen_time=position.time, seen_azimuth=azimuth, confirm_left=left)
+        m = changed(m, seen_time=position.time, seen_azimuth=azimuth, confirm_left=left, seen=m.seen + 1)
     if not position.found or position.time <= max(m.capture_time, m.since, m.ignore_until):
         return m
     p_OV = apply(position.X_OL, position.p_LV)
@@ -487,7 +503,9 @@ def _sweep(
     if abs(m.to_turn) > TURNED:
         rate = towards(m.to_turn, config.turn_speed, config.turn_acceleration, dt)
         return changed(m, turn_rate=slew(m.turn_rate, rate, config.turn_acceleration * dt)), goal
-    m = changed(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt), to_turn=0.0)
+    m = changed(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt))
+    if m.to_turn:
+        m = changed(m, to_turn=0.0, owed=m.to_turn)
     if np.max(np.abs(goal - m.torso)[1:]) > BEHIND:  # the neck is still on its way, after a look aside or a new pitch
         return m, goal
     if m.side * wrap(heading + m.gaze - m.seen_azimuth) > config.ahead:  # or a slow camera would miss what is passed
@@ -496,11 +514,11 @@ def _sweep(
     m = changed(m, gaze=float(gaze))
     # It does not turn back before its images join those of the next sweep.
     unseen = m.side * wrap(heading + m.gaze - m.seen_azimuth)
-    if gaze == m.side * end and unseen <= max(end + sight.aside - np.pi / round_, JOINS):
+    if gaze == m.side * end and m.seen and unseen <= max(end + sight.aside - np.pi / round_, JOINS):
         sweeps = m.sweeps + 1
         onward = m.side if sweeps % round_ % 2 else -m.side  # every turn of a round goes the same way
-        turn = onward * 2 * np.pi / round_ if sweeps % round_ else 0.0
-        m = changed(m, sweeps=sweeps, side=-m.side, to_turn=turn)
+        turn = onward * 2 * np.pi / round_ + m.owed if sweeps % round_ else 0.0
+        m = changed(m, sweeps=sweeps, side=-m.side, to_turn=turn, owed=0.0, seen=0)
         if sweeps == round_ * len(config.pitches):
             where = "all round" if round_ > 1 else "as far as the head turns"
             m = _end(m, "failed", Verdict.NOT_FOUND, f"no marker in {sweeps} sweeps {where}")
@@ -510,5 +528,6 @@ def _sweep(
 
 def _sweep_torso(config: ValveSearchConfig, gaze: float, pitch: float) -> np.ndarray:
     """Waist and neck share the gaze in proportion to their ranges."""
-    share = config.sweep_waist / (config.sweep_waist + config.sweep_yaw)
+    whole = config.sweep_waist + config.sweep_yaw
+    share = config.sweep_waist / whole if whole else 0.0  # a head that does not turn
     return np.array([share * gaze, pitch, (1 - share) * gaze])

@@ -41,10 +41,10 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
     command      out  Command            torso always, base_twist in search
     status       out  Status
 
-    head_pose: base (x, y, heading) in O, torso (n,) -> X_OL (3, 4). rest: the torso's joints at home (n,). waist: which
-    of them is the waist; None: the robot has none. The last two are tilt and pan. The gaze is that of waist (0 if there
-    is none), tilt and pan. The lift is driven to the stance's in fine_approach, and stays there. signs: of waist, tilt
-    and pan: 1 for a joint that turns it to the left, down, left as it grows (3,); None: all do.
+    head_pose: base (x, y, heading) in O, torso (n,) -> X_OL (3, 4). rest: the torso's joints at home (n,). gaze: which
+    of them are waist, tilt and pan, of which tilt and pan come last; None: the robot has none, and its angle is 0. The
+    lift is driven to the stance's in fine_approach, and stays there. signs: of waist, tilt and pan: 1 for a joint that
+    turns it to the left, down, left as it grows (3,); None: all do.
     look: where to look near the valve, off the marker's middle, in V (3,); None: at the marker. drive: of the base.
     sight: of the eyes.
     """
@@ -56,7 +56,7 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         config: ValveSearchConfig,
         head_pose: HeadPose,
         rest: np.ndarray,
-        waist: int | None,
+        gaze: tuple[int | None, int | None, int | None],
         signs: np.ndarray | None = None,
         look: np.ndarray | None = None,
         drive: Drive = DIFFERENTIAL,
@@ -64,7 +64,7 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         name: str = "valve_search",
     ):
         config.check()
-        self.config = config if waist is not None else dc.replace(config, sweep_waist=0.0)
+        self.config = config if gaze[0] is not None else dc.replace(config, sweep_waist=0.0)
         if drive.fixed:
             self.config = bolted(self.config, sight)
         else:
@@ -74,9 +74,10 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
                 turn_speed=min(config.turn_speed, speed),
                 turn_acceleration=min(config.turn_acceleration, acceleration),
             )
-        self._rest, self._waist, self._look, self._drive, self._sight = rest, waist, look, drive, sight
+        self._rest, self._gaze, self._look, self._drive, self._sight = rest, gaze, look, drive, sight
+        self._held = len(rest) - sum(joint is not None for joint in gaze[1:])  # lift and waist
         self._signs = np.ones(3) if signs is None else signs
-        self._plain = waist == 0 and len(rest) == 3 and bool((self._signs > 0).all())  # the torso is the gaze
+        self._plain = gaze == (0, 1, 2) and len(rest) == 3 and bool((self._signs > 0).all())  # the torso is the gaze
         self._whole_pose = head_pose
         super().__init__(name, period=2 * TICK)
 
@@ -85,13 +86,13 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
 
     def step(self, time: float, inputs: ValveSearchInputs, memory: Memory) -> tuple[Memory, Outputs]:
         stance = inputs.stance
-        if inputs.mode.mode == Mode.FINE_APPROACH and stance.found and len(stance.posture) == len(self._rest) - 2:
+        if inputs.mode.mode == Mode.FINE_APPROACH and stance.found and len(stance.posture) == self._held:
             memory = changed(memory, lift=stance.posture)
-        lift = self._rest[:-2] if memory.lift is None else memory.lift
+        lift = self._rest[: self._held] if memory.lift is None else memory.lift
         measured = inputs.robot_state.torso
 
         def head_pose(base: np.ndarray, gaze: np.ndarray) -> np.ndarray:
-            return self._whole_pose(base, gaze if self._plain else self._torso(gaze, measured[:-2]))
+            return self._whole_pose(base, gaze if self._plain else self._torso(gaze, measured[: self._held]))
 
         memory, command, status = step(
             self.config,
@@ -115,14 +116,14 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         """The state with the gaze for its torso."""
         if self._plain:
             return state
-        waist = 0.0 if self._waist is None else state.torso[self._waist]
-        return dc.replace(state, torso=self._signs * [waist, *state.torso[-2:]])
+        gaze = [0.0 if joint is None else state.torso[joint] for joint in self._gaze]
+        return dc.replace(state, torso=self._signs * gaze)
 
     def _torso(self, gaze: np.ndarray, posture: np.ndarray) -> np.ndarray:
         """The torso's joints for waist, tilt and pan; posture: lift and waist, of which the lift counts."""
         torso, gaze = self._rest.copy(), self._signs * gaze
         torso[: len(posture)] = posture
-        torso[-2:] = gaze[1:]
-        if self._waist is not None:
-            torso[self._waist] = gaze[0]
+        for joint, angle in zip(self._gaze, gaze):
+            if joint is not None:
+                torso[joint] = angle
         return torso

@@ -530,11 +530,11 @@ def draft(robot: Robot, found: Guess, model: str, mends: Iterable[str]) -> tuple
 
 def _gaze(robot: Robot, found: Guess, ask: Ask) -> list[str]:
     if found.pan is None and found.tilt is None:
-        return ["# gaze: " + ask("gaze: no joint of a head was found: the cameras look where the base stands")[2:]]
+        return ["# gaze: " + ask("gaze: no joint of a head was found: the eyes look where they are mounted")[2:]]
     poses, lines = robot.poses(), ["gaze:"]
     for key, name, axis, way in (("pan", found.pan, 2, "to the left"), ("tilt", found.tilt, 1, "downwards")):
         if name is None:
-            lines.append(f"  # {key}: " + ask(f"gaze.{key}: no such joint of a head was found")[2:])
+            lines.append(f"  # {key}: " + ask(f"gaze.{key}: no such joint of a head was found: does it turn so?")[2:])
         else:
             backwards = _axis(robot.joints[name], poses)[axis] < 0
             lines.append(f"  {key}: {_key(name)}  # turns {'the other way than ' if backwards else ''}{way}")

@@ -12,7 +12,7 @@ POSE = ("x", "y", "heading")  # of the base, by its odometry [m, rad]
 class Groups:
     """Names of a robot's joints, as in its model, in the order of every vector of the group.
 
-    torso: lift and waist, if there are, then the head's tilt and pan; arms: from the shoulder on.
+    torso: lift and waist, then the head's tilt and pan, as far as there are; arms: from the shoulder on.
     twist: the speeds that the base has (drive.py). absent: devices of the contract that the robot does not have, whose
     ports no device speaks for.
     """

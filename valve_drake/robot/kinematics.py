@@ -109,6 +109,9 @@ class RobotKinematics(Protocol):
     def split(self, q: np.ndarray) -> dict[str, np.ndarray]:
         """Both arms' joints (n + m,) -> by side."""
 
+    def held(self, torso: np.ndarray) -> np.ndarray:
+        """The posture, of the torso's joints (..., n) -> (..., m); empty where they were not measured yet."""
+
     def forward(self, side: str, q: np.ndarray, posture: np.ndarray | None = None) -> np.ndarray:
         """X_BG (3, 4)."""
 

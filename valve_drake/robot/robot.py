@@ -51,6 +51,7 @@ _ORIGIN = np.zeros(3)
 _OPENINGS = 65  # positions of a gripper's joint at which its opening is read
 ROOM = 0.2  # between a base that turns and a panel [m]
 _ON_WAY = 1e-4  # by which a base's frame may be off the way of its joints [m, rad]
+_AHEAD = 0.1  # by which a head without a pan may look aside [rad]: as near do the images of a sweep join
 _TOUCH = 1e-4  # an opening may lack so much of what is asked for [m]
 
 
@@ -127,7 +128,7 @@ class Robot:
     base: Joints  # x, y, yaw; none if it is fixed
     drive: Drive  # its speeds
     posture: Joints  # lift and waist: what holds still while the hands work
-    torso: Joints  # posture, tilt, pan
+    torso: Joints  # posture, tilt, pan, as far as there are
     arms: Mapping[str, Arm]
     hands: Mapping[str, HandLoad]
     grippers: Mapping[str, Gripper]
@@ -190,6 +191,7 @@ class Robot:
         self._ends = [float(self._pose(chain.shoulder)[0, 3]) + chain.reach for chain in self._chains.values()]
         self._check_sides()
         self._check_posture()
+        self._check_ahead()
         self.gaze_signs = _locked(self._gaze_signs())
         self.grippers = MappingProxyType({side: self._gripper(side, joint[f"grippers.{side}.joint"]) for side in SIDES})
         for side in SIDES:
@@ -210,10 +212,15 @@ class Robot:
         return self
 
     @property
-    def waist(self) -> int | None:
-        """Which of the torso's joints is the waist; None: the robot has none."""
-        name = self.description.gaze.waist
-        return self.torso.names.index(name) if name else None
+    def gaze(self) -> tuple[int | None, int | None, int | None]:
+        """Which of the torso's joints are waist, tilt and pan; None: the robot has none."""
+        names, d = self.torso.names, self.description.gaze
+        waist, tilt, pan = (names.index(name) if name else None for name in (d.waist, d.tilt, d.pan))
+        return waist, tilt, pan
+
+    def held(self, torso: np.ndarray) -> np.ndarray:
+        """See RobotKinematics."""
+        return torso[..., : len(self.posture)]
 
     @property
     def lift(self) -> int:
@@ -236,13 +243,14 @@ class Robot:
     @property
     def groups(self) -> Groups:
         """The joints that are commanded by position, the base's speeds, and the devices that there are none of."""
-        absent = [f"{side}_wrist_sensor" for side in SIDES if self.feels_by_torque(side)]
+        absent = [name for name, there in (("base", self.base), ("torso", self.torso)) if not len(there)]
+        absent += [f"{side}_wrist_sensor" for side in SIDES if self.feels_by_torque(side)]
         return Groups(
             self.torso.names,
             self.arms[LEFT].names,
             self.arms[RIGHT].names,
             self.drive.names,
-            (*(["base"] if self.drive.fixed else []), *absent),
+            tuple(absent),
         )
 
     def feels_by_torque(self, side: str) -> bool:
@@ -509,12 +517,19 @@ class Robot:
 
     def _check_posture(self) -> None:
         """What holds still while the hands work carries them: lift and waist."""
-        keys = [f"lift.joints[{k}]" for k in range(self.lift)] + ["gaze.waist"] * (self.waist is not None)
+        keys = [f"lift.joints[{k}]" for k in range(self.lift)] + ["gaze.waist"] * (self.gaze[0] is not None)
         for key, name in zip(keys, self.posture.names):
             for side in SIDES:
                 shoulder = self._chains[side].shoulder
                 carried = [joint.name() for joint in _carriers(self._plant, self.model.robot, shoulder)]
                 require(name in carried, key, "a joint that carries both arms", name)
+
+    def _check_ahead(self) -> None:
+        """Eyes that nothing turns aside look where the base stands: the search turns it by the gaze."""
+        x, y, _ = self.X_BL(self.torso.home)[:, 2]
+        aside = math.atan2(y, x)
+        words = f"a joint, or the left eye has to look ahead within {_AHEAD:g} rad; it looks {aside:.2f} rad left"
+        require(bool(self.description.gaze.pan) or abs(aside) < _AHEAD, "gaze.pan", words, "")
 
     def _gaze_signs(self) -> np.ndarray:
         """Read off the model by how the eye's axis moves; 1 for a joint that the robot lacks."""

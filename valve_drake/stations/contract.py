@@ -16,6 +16,7 @@ MATE = {HEAD[0]: HEAD[1], HEAD[1]: HEAD[0], WRISTS[0]: WRISTS[1], WRISTS[1]: WRI
 TRUTH = "truth."
 SAID_BY = {  # devices that a robot may lack (Groups.absent) -> the port that shows what they say
     "base": "base.odometry",
+    "torso": "torso.position_measured",
     **{f"{side}_wrist_sensor": f"{side}_wrist.wrench" for side in SIDES},
 }
 
@@ -41,7 +42,7 @@ CONTRACT: tuple[PortSpec, ...] = (
     PortSpec(
         "base.twist_command", "in", "twist", "m/s, rad/s", "those that the base has of forward, sideways, yaw rate"
     ),
-    PortSpec("torso.position_command", "in", "torso", "rad, m", "lift and waist, if there are; tilt, pan"),
+    PortSpec("torso.position_command", "in", "torso", "rad, m", "lift, waist, tilt, pan, as far as there are"),
     *_both("arm.position_command", "in", "arm", "rad"),
     *_both("gripper.position_command", "in", 1, "m", "opening between the pads"),
     *_both("gripper.force_limit", "in", 1, "N", "of the finger actuator"),

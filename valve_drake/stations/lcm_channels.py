@@ -200,7 +200,7 @@ def _rows() -> Iterable[Channel]:
     )  # fmt: skip
     joints = "joint_position [rad]; num_torques 0"
     turns = "waist and pan to the left, tilt downwards"
-    torso = "lift and waist, if the robot has them, tilt, pan"
+    torso = "lift, waist, tilt, pan, those that the robot has"
     yield Channel(
         "torso.command", CONTROLLER, lcmt_iiwa_command, TICKS, f"{torso}: {joints}; {turns}",
         *_joint_command("torso.position_command"),
@@ -312,7 +312,8 @@ IMAGES = {camera: CHANNELS[f"{camera}.image"] for camera in CAMERAS}
 
 
 def present(rows: Iterable[Channel], groups: Groups) -> tuple[Channel, ...]:
-    """Those of the devices that a robot has: a fixed base and a hand without a force sensor say and hear nothing."""
+    """Those of the devices that a robot has: a fixed base, a torso without joints and a hand
+    without a force sensor say and hear nothing."""
     return tuple(row for row in rows if row.device not in groups.absent)
 
 

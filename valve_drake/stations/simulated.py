@@ -400,8 +400,12 @@ def make_simulated_station(
         builder.ExportInput(done.get(name, physics.GetInputPort(name)), name)
     measured: dict[str, tuple[np.ndarray, np.ndarray | float]] = {
         POSITIONS: (np.eye(plant.num_positions(), physics.size), 0.0),
-        "torso.position_measured": (_select(physics, robot.torso.names, "position"), 0.0),
     }
+    if len(robot.torso):
+        measured["torso.position_measured"] = _select(physics, robot.torso.names, "position"), 0.0
+    else:
+        nothing = builder.AddNamedSystem("torso", ConstantVectorSource(np.zeros(0)))
+        builder.ExportOutput(nothing.get_output_port(), "torso.position_measured")
     if not robot.drive.fixed:
         rows = [_select(physics, robot.base.names, what) for what in ("position", "velocity")]
         measured[BASE] = np.vstack(rows), 0.0

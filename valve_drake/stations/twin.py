@@ -227,7 +227,7 @@ class Guard:
                 target = _bounded(self._targets[port + "command"], goal, BACK if stopped else self._speed[row.device])
                 if stopped and np.array_equal(target, goal):
                     self._stopped.discard(row.key)
-                behind = not stopped and np.max(np.abs(goal - target)) > BEHIND
+                behind = not stopped and bool(np.any(np.abs(goal - target) > BEHIND))
                 (self._behind.add if behind else self._behind.discard)(row.key)
             targets[port + "command"] = target
         self._targets = targets
@@ -253,7 +253,8 @@ def _problem(device: str, values: Values, measured: Values) -> str:
     if device == "base":
         return "" if np.all(np.abs(whole(values["base.twist_command"])) <= FAST) else "too fast"
     if device in GROUPS:
-        far = np.max(np.abs(values[f"{device}.position_command"] - measured[f"{device}.position_measured"]))
+        off = values[f"{device}.position_command"] - measured[f"{device}.position_measured"]
+        far = np.max(np.abs(off), initial=0.0)
         return "" if far <= FAR else f"{far:.2f} rad off the measured position"
     opening, force = (float(value[0]) for value in values.values())
     return "" if -1e-3 <= opening <= GRIP[0] and 0 <= force <= GRIP[1] else "out of range"
