@@ -7,7 +7,7 @@ import pytest
 from helpers import Rig, assert_clones_are_independent, assert_holds_between_updates, ports
 from robot_facts import ROBOT
 
-from valve_drake.behaviors import valve_search
+from valve_drake.behaviors import base_approach, valve_search
 from valve_drake.behaviors.base_approach import BaseApproachConfig, MedianPlace, Memory, bounded, step
 from valve_drake.behaviors.base_approach_system import BaseApproachSystem
 from valve_drake.checks import ConfigError
@@ -202,7 +202,55 @@ def assert_clear(run: Run, scene: Scene, start: np.ndarray) -> None:
     assert scene.clear(run.poses) > nearest - 0.001
 
 
+@dc.dataclass
+class Post(Scene):
+    """A valve that lies flat on a post: `marker` has the heading of the stance, which may be on any side."""
+
+    depth: float = 0.22  # the stance is half a metre from the stem
+
+    def look(self, time, pose):
+        found = super().look(time, pose)
+        flat = make(np.diag([1.0, -1.0, -1.0]), found[1].X_LV[:, 3])
+        return found[0], dc.replace(found[1], X_LV=flat), found[2]
+
+
 # ---------------------------------------------------------------- fine approach
+
+
+@pytest.mark.parametrize("base, wheels", [(DIFFERENTIAL, Wheels), (OMNI, Omniwheels)], ids=["wheels", "omniwheels"])
+def test_the_base_drives_round_a_valve_that_lies_flat_and_not_against_it(base, wheels):
+    """The stance is on another side of the post than the robot, up to just behind it."""
+    rng, panel = np.random.default_rng(5), VALVE.panel
+    keep = min(CONFIG.clearance + np.hypot(panel.width, panel.height) / 2, 0.5 + CONFIG.pre_stance)
+    for bearing in (-175, -120, -60, 0, 45, 90, 150):
+        scene = Post(np.array([*rng.uniform(-2, 2, 2), rng.uniform(-3, 3)]), rng)
+        start = place(scene, np.deg2rad(bearing), 1.3, rng.uniform(-0.3, 0.3))
+        run = drive(Mode.FINE_APPROACH, wheels(start), scene, base=base, limit=60.0)
+        assert_arrived(run, scene)
+        off = run.poses[:, :2] - scene.marker[:2]
+        far = np.hypot(*off.T)
+        h = scene.marker[2]
+        aside = np.abs(off @ [-np.sin(h), np.cos(h)])
+        behind = off @ [np.cos(h), np.sin(h)] < 0  # on the side of the stance
+        on_line = behind & (aside < CONFIG.pre_stance / 4)
+        assert far[~on_line].min(initial=np.inf) > keep - 0.04, bearing
+        assert far.min() > 0.48
+
+
+@pytest.mark.parametrize("way", [0.3, 1.0, -1.6, 3.0])
+def test_a_way_round_a_post_touches_its_circle_and_leads_to_the_goal(way):
+    post, keep = np.array([0.4, -0.2]), 0.8
+    goal = post + 1.1 * np.array([np.cos(way), np.sin(way)])
+    at, went = post + np.array([1.3, 0.0]), 0.0
+    for _ in range(2000):
+        there = base_approach._round(at, goal, post, keep)
+        step_ = there - at
+        if np.hypot(*step_) < 0.01:
+            break
+        step_ *= min(1.0, 0.01 / np.hypot(*step_))
+        at, went = at + step_, went + np.hypot(*step_)
+        assert np.hypot(*(at - post)) > keep
+    assert np.hypot(*(at - goal)) < 0.01 and went < 1.3 * abs(way) + 0.5
 
 
 @pytest.mark.system

@@ -215,6 +215,16 @@ def test_a_place_that_took_long_to_find_is_tried_first_when_the_valve_is_measure
     assert third.margin < 0 and steps > short
 
 
+def test_the_place_before_stays_where_it_is_when_the_markers_other_end_is_taken_for_its_x():
+    """A robot that drives round a valve that lies flat sees it from another side."""
+    dut = stances(distance_min=0.5, distance_max=0.54)
+    X_OA = valve_at(0.75, tilt=90.0)
+    found, _ = searched(dut, dut.begin(X_OA, np.pi / 2, np.array([0.7, 0.4])))
+    assert dut.moved(found, turned(X_OA, np.pi), np.pi / 2) == pytest.approx(found.best.base)
+    assert dut.moved(found, turned(X_OA, -np.pi + 0.01), np.pi / 2) == pytest.approx(found.best.base)
+    assert dut.moved(found, turned(X_OA, np.pi / 2), np.pi / 2) is None  # handles where there were none
+
+
 def test_the_place_before_turns_with_the_heading_of_the_valve():
     """A valve in a corner, turned from a step aside."""
     X_OA = valve_at(1.0)

@@ -16,7 +16,9 @@
 
 The base's centre never comes nearer to the panel's plane than `clearance`. A stance nearer than that is refused; from
 an allowed start the base drives straight lines between allowed points, so no line can cross the clearance. From a
-start nearer than that the base only moves away: the pre-stance is farther out.
+start nearer than that the base only moves away: the pre-stance is farther out. About a valve whose axis is upright,
+which has no panel to stay before, the base drives round: it keeps `clearance` from the panel's corners till it is on
+the line in.
 
 In the stance's frame: s along its heading, e to its left, psi the heading against it.
 Line law: psi_ref = -atan(e / look_ahead).
@@ -49,6 +51,8 @@ from valve_drake.task.modes import owned
 from valve_drake.valve.valve import Valve, has_heading
 
 MODES = owned("base_approach")
+BEYOND = 0.35  # of a way round a post, past where it touches the circle about it [rad]
+ROUND = 0.05  # by which that circle is wider than what has to be kept clear of [m]
 SLIM = 0.15  # so much nearer to an upright axis than to a panel may the base come; lower it for a wide post [m]
 STILL = np.zeros(3)
 STILL.setflags(write=False)
@@ -352,9 +356,10 @@ def _fine(
         if time - m.since > config.stance_patience and not under_way:
             return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
         return changed(m, detail="waiting for a stance"), STILL
-    goal, panel = m.stance.median, m.panel.median
+    goal, panel, keep = m.stance.median, m.panel.median, 0.0
     if np.isnan(panel[2]):  # an upright axis: a plane behind its post, facing the stance
-        panel = np.array([*_ahead(np.array([*panel[:2], goal[2]]), SLIM), goal[2]])
+        stem, keep = panel[:2], config.clearance + math.hypot(valve.panel.width, valve.panel.height) / 2
+        panel = np.array([*_ahead(np.array([*stem, goal[2]]), SLIM), goal[2]])
     room = -_offset(goal, panel).s - config.clearance
     if room < 0 and not drive.fixed:
         return _end(m, "failed", Verdict.REACH_LIMIT, f"the stance is {-room:.3f} m too near to the panel")
@@ -362,16 +367,21 @@ def _fine(
     at = _offset(base, goal)
     if m.phase != "settle":
         m = changed(m, quiet_since=time)  # stillness counts from there on
+    there = _pre_stance(config, goal)
+    if keep:
+        there = _round(base[:2], there, stem, keep)
     if m.phase == "plan":
-        m = _plan(config, m, base, goal, at, _ahead(panel, valve.marker.xyz[2] - valve.panel.depth), drive)
+        m = _plan(config, m, base, there, at, _ahead(panel, valve.marker.xyz[2] - valve.panel.depth), drive)
         if m.result == "failed":
             return m, STILL
     if m.phase == "settle":
         m, twist = _settle(config, m, time, dt, state, at, drive)
     elif drive.sideways:
-        m, twist = _go(config, drive, m, dt, base, goal, at, _offset(base, panel).s + config.clearance > NEAR)
+        near = _offset(base, panel).s + config.clearance > NEAR
+        beside = keep > 0 and (at.s > 0 or abs(at.e) > BESIDE * config.pre_stance)  # of the line in, at a post
+        m, twist = _go(config, drive, m, dt, base, there if near or beside else goal[:2], at, near or beside)
     else:
-        m, twist = PHASES[m.phase](config, m, dt, base, goal, at)
+        m, twist = PHASES[m.phase](config, m, dt, base, there, at)
     if m.result == "running":
         m = changed(m, detail=f"{m.phase}: {-at.s:.3f} m to go, {at.e:+.3f} m aside, {np.degrees(at.psi):+.1f} deg")
     return m, twist
@@ -380,6 +390,24 @@ def _fine(
 def _ahead(pose: np.ndarray, distance: float) -> np.ndarray:
     """The point `distance` ahead of a pose (x, y, heading) -> (2,)."""
     return pose[:2] + distance * np.array([np.cos(pose[2]), np.sin(pose[2])])
+
+
+def _round(start: np.ndarray, goal: np.ndarray, post: np.ndarray, keep: float) -> np.ndarray:
+    """Where to drive from `start` to come to `goal` and keep clear of a post by `keep` [m], all on the floor (2,).
+
+    It is the goal if the straight way there is clear, else a point on the tangent to the circle about the post. From a
+    start or to a goal within the circle the way may come no nearer than that.
+    """
+    way, off = goal - start, start - post
+    share = float(np.clip(-(off @ way) / max(float(way @ way), 1e-12), 0.0, 1.0))
+    least = min(keep, math.hypot(*off), math.hypot(*(goal - post)))
+    if math.hypot(*(off + share * way)) >= least - 1e-6:
+        return goal
+    radius, far = keep + ROUND, math.hypot(*off)
+    bearing, to = math.atan2(off[1], off[0]), math.atan2(*(goal - post)[::-1])
+    side = math.copysign(1.0, wrap(to - bearing))
+    angle = bearing + side * (math.acos(min(radius / far, 1.0)) + BEYOND)
+    return post + radius / math.cos(BEYOND) * np.array([math.cos(angle), math.sin(angle)])
 
 
 def _panel(valve: Valve, estimate: RectangleEstimate) -> np.ndarray:
@@ -404,12 +432,12 @@ def _plan(
     config: BaseApproachConfig,
     m: Memory,
     base: np.ndarray,
-    goal: np.ndarray,
+    there: np.ndarray,
     at: _Offset,
     marker: np.ndarray,
     drive: Drive,
 ) -> Memory:
-    """Chooses the first phase of a new attempt. marker: its centre on the floor (2,)."""
+    """Chooses the first phase of a new attempt. there: where it leads first; marker: its centre, on the floor (2,)."""
     if _within(config, at):
         return changed(m, phase="settle")
     if drive.fixed:
@@ -422,7 +450,7 @@ def _plan(
     # In the funnel before the stance the line law alone brings it in.
     if -FUNNEL * config.pre_stance < at.s < 0 and abs(at.e) < -at.s * FUNNEL_SLOPE and abs(at.psi) < config.facing:
         return changed(m, phase="line")
-    way = _pre_stance(config, goal) - base[:2]
+    way = there - base[:2]
     if np.linalg.norm(way) < AT_PRE_STANCE:
         return changed(m, phase="align")
     # The widest angle between the robot's front and the marker on the way, for driving forwards and backwards.
@@ -440,18 +468,18 @@ def _course_error(m: Memory, base: np.ndarray, way: np.ndarray) -> float:
 
 
 def _turn_phase(
-    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
+    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, there: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
-    error = _course_error(m, base, _pre_stance(config, goal) - base[:2])
+    error = _course_error(m, base, there - base[:2])
     if abs(error) < POINTED and abs(m.twist[2]) < POINTED_RATE:
         return changed(m, phase="drive"), STILL
     return m, _motion(rate=_turn(config, error, dt))
 
 
 def _drive_phase(
-    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
+    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, there: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
-    way = _pre_stance(config, goal) - base[:2]
+    way = there - base[:2]
     left = m.direction * float(way @ [np.cos(base[2]), np.sin(base[2])])
     if left < THERE:
         return changed(m, phase="align"), STILL
@@ -465,7 +493,7 @@ def _drive_phase(
 
 
 def _align_phase(
-    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
+    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, there: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
     if abs(at.psi) < ALIGNED and abs(m.twist[2]) < ALIGNED_RATE:
         # Too far aside for the line law: a new attempt.
@@ -474,7 +502,7 @@ def _align_phase(
 
 
 def _line_phase(
-    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, goal: np.ndarray, at: _Offset
+    config: BaseApproachConfig, m: Memory, dt: float, base: np.ndarray, there: np.ndarray, at: _Offset
 ) -> tuple[Memory, np.ndarray]:
     if at.s > -LINE_END:
         return changed(m, phase="settle"), STILL
@@ -489,14 +517,14 @@ def _go(
     m: Memory,
     dt: float,
     base: np.ndarray,
-    goal: np.ndarray,
+    there: np.ndarray,
     at: _Offset,
-    near: bool,
+    first: bool,
 ) -> tuple[Memory, np.ndarray]:
-    """Straight to the stance. near: the base is within `clearance` of the panel, and moves away first."""
-    way = (_pre_stance(config, goal) if near else goal[:2]) - base[:2]
+    """Straight to the stance. there: to it (2,), or, if `first`, to where it has to go before."""
+    way = there - base[:2]
     left = math.hypot(*way.tolist())
-    if not near and left < config.position_tolerance and abs(at.psi) < config.heading_tolerance:
+    if not first and left < config.position_tolerance and abs(at.psi) < config.heading_tolerance:
         return changed(m, phase="settle"), STILL
     speed = config.line_speed if left < config.pre_stance else config.fine_speed
     return m, _towards(config, drive, way, float(base[2]), speed, _turn(config, -at.psi, dt), dt)

@@ -31,7 +31,7 @@ from valve_drake.messages import (
     RectangleEstimate,
     Stance,
 )
-from valve_drake.perception.fusion import fuse
+from valve_drake.perception.fusion import MOVING, fuse
 from valve_drake.robot.kinematics import OUTWARD
 from valve_drake.task.modes import TABLE
 
@@ -102,7 +102,7 @@ class StancePlanner:
             if not m.looks or m.looks[-1] is m.searched:
                 return m
             m, before = changed(m, searched=m.looks[-1]), m.last
-            fused = fuse(m.looks)
+            fused = fuse(m.looks, apart=MOVING)
             if not fused.found:
                 return m
             X_OA, viewer = self.stances.valve.place(fused.X_OV, fused.angle), m.looks[-1].X_OL[:2, 3]

@@ -8,7 +8,7 @@ from valve_drake.behaviors.arc_search import ONE_GRASP, ArcSearch, GraspSearch
 from valve_drake.behaviors.grasp_geometry import Arc, Turn
 from valve_drake.behaviors.stance_config import StanceConfig
 from valve_drake.frames import compose, inverse, planar, rot_z, rotation_vector
-from valve_drake.valve.valve import has_heading, heading, turned
+from valve_drake.valve.valve import angle_turned, has_heading, heading, turned
 
 AROUND = (0.5, -0.5, 1.0, -1.0)  # sides from which a valve with an upright axis is tried, off the nearest [rad]
 FEW = 9  # distances of a search's first round
@@ -100,11 +100,19 @@ class Stances(GraspSearch):
         """
         if search.best is None or self.bolted or turn_angle != search.turn_angle:
             return None
+        X_OA = self._alike(search.X_OA, X_OA)
         off = _swing(search.X_OA, X_OA)
         tilt = rotation_vector(rot_z(off) @ search.X_OA[:, :3] @ X_OA[:, :3].T)
         if abs(X_OA[2, 3] - search.X_OA[2, 3]) > SAME_HEIGHT or np.linalg.norm(tilt) > SAME_TILT:
             return None
         return _moved(search.best.base, search.X_OA, X_OA)
+
+    def _alike(self, X_OA: np.ndarray, X_OA1: np.ndarray) -> np.ndarray:
+        """The second pose, turned about its axis to what looks the same and is nearest to the first: from another side
+        the cameras may take the other end of a marker for its X."""
+        period = self.valve.repeats(True)
+        times = round(angle_turned(X_OA, X_OA1) / period)
+        return turned(X_OA1, -times * period) if times else X_OA1
 
     def _places(
         self, X_OA: np.ndarray, viewer: np.ndarray, posture: np.ndarray | None
