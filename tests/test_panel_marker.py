@@ -117,6 +117,26 @@ def test_a_mark_that_the_image_cuts_off_does_not_count_and_none_is_no_angle():
     assert shape.seen_by(look(shape, facing(1.1, -0.1, 0.35, 0.0, 0.0, -0.12), 0.2))
 
 
+@pytest.mark.parametrize(
+    "angle, room, seen", [(0.0, 15.0, True), (0.0, 7.0, False), (0.5, 15.0, False), (0.5, 24.0, True)]
+)
+def test_a_mark_near_the_border_counts_as_long_as_it_is_whole_whichever_way_it_lies(angle, room, seen):
+    """A mark is 39 px long here and 21 high: of a level bar it ends 11 px below its middle."""
+    shape = valve()
+    marker = shape.target()
+    X = frames.make(np.eye(3), np.array([-0.1, -0.12, 1.1]))
+    p = marker.marks[0]
+    axis = shape.X_VA()
+    mark = frames.apply(frames.compose(axis, frames.make(frames.rot_z(-angle), np.zeros(3)), frames.inverse(axis)), p)
+    at_border = HEAD.left.normalize(np.array([[320.0, 479.0 - room]]))[0, 1]
+    X[1, 3] = at_border * (X[2, 3] + mark[2]) - mark[1]
+    P = X[:, 3] + mark
+    edges = edge_points(X, HEAD, marker, 0.05)
+    found = estimate(dc.replace(edges, left=dc.replace(edges.left, green=P[None, :2] / P[2])), HEAD, marker, CONFIG)
+    assert found.found and found.angle_seen == seen
+    assert not seen or math.sin(found.angle - angle) == pytest.approx(0.0, abs=1e-6)
+
+
 def test_the_axis_turns_by_the_marks_angle_and_looks_are_fused_so():
     shape, X = valve(), frames.make(np.eye(3), np.array([0.0, 0.0, 1.0]))
     assert angle_turned(shape.place(X, 0.0), shape.place(X, 0.6)) == pytest.approx(0.6)

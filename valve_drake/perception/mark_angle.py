@@ -18,7 +18,9 @@ _OFF = 0.12  # a spot so far from a mark's circle is another thing [radii]
 _ALIKE = 0.1  # marks that propose angles so near to each other agree: the marker's pose is as good as that [rad]
 _TOGETHER = 0.03  # the mean is of those that are so near to it [rad]
 _SPOT = 0.7  # standard deviation of a green spot's middle [px]
-_HALF = 0.025  # of a mark's length: nearer to the image's border a part of it is cut off, and its middle is another [m]
+# Half a mark along its handle and across it, and a pixel: what reaches beyond the image is cut off, and its middle is
+# another [m], [px].
+_HALF, _PIXEL = (0.020, 0.011), 2.0
 
 
 class MarkAngle(NamedTuple):
@@ -36,7 +38,7 @@ def mark_angle(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker, 
     """
     assert marker.X_VA is not None
     X_LA = frames.compose(frames.make(R, p), marker.X_VA)
-    marks = frames.apply(frames.inverse(marker.X_VA), marker.marks)
+    marks, along = frames.apply(frames.inverse(marker.X_VA), marker.marks), marker.along @ marker.X_VA[:, :3]
     seen: list[tuple[float, float, tuple[int, int]]] = []  # angle, its variance, camera and mark
     for camera, view in enumerate(views):
         X_AC = frames.inverse(frames.compose(view.X_CL, X_LA))
@@ -47,10 +49,12 @@ def mark_angle(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker, 
             for ray, room in zip(rays, view.room):
                 scale = far / ray[2] if abs(ray[2]) > 1e-6 else 0.0
                 x, y = X_AC[:2, 3] + scale * ray[:2]
-                whole = room * scale > _HALF * view.focal
-                if whole and abs(math.hypot(x, y) / radius - 1) < _OFF:
+                if scale <= 0 or abs(math.hypot(x, y) / radius - 1) >= _OFF:
+                    continue
+                angle = at - math.atan2(y, x)
+                if _whole(frames.rot_z(-angle) @ along[k], np.array([x, y, mark[2]]), X_AC, view.focal, room):
                     sigma = _SPOT / view.focal * scale / radius
-                    seen.append((frames.wrap(at - math.atan2(y, x)), sigma**2, (camera, k)))
+                    seen.append((frames.wrap(angle), sigma**2, (camera, k)))
     if not seen:
         return None
     angles, variances = (np.array(values) for values in list(zip(*seen))[:2])
@@ -70,3 +74,13 @@ def mark_angle(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker, 
     sigma = math.sqrt(1 / weights.sum() + scatter / own.sum())
     turns = round((near - angles[best] - mean) / (2 * math.pi))
     return MarkAngle(float(angles[best]) + mean + 2 * math.pi * turns, sigma, most)
+
+
+def _whole(along: np.ndarray, middle: np.ndarray, X_AC: np.ndarray, focal: float, room: np.ndarray) -> bool:
+    """Whether a mark at `middle`, its longer side `along`, both in A, is in the image whole. room: see View."""
+    across = np.array([-along[1], along[0], 0.0])
+    corners = [middle + i * _HALF[0] * along + k * _HALF[1] * across for i in (-1, 1) for k in (-1, 1)]
+    P = frames.apply(frames.inverse(X_AC), np.array([middle, *corners]))
+    px = focal * P[:, :2] / P[:, 2:]
+    off = px[1:] - px[0]
+    return bool((np.concatenate([-off.min(0), off.max(0)]) + _PIXEL < room).all())

@@ -22,12 +22,13 @@ class Marker:
 
     size: 2 X_w, 2 Y_w [m]; marks: their places in V (K, 3) [m]; X_VA: of a rectangle that does not turn with the valve,
     the valve's axis (z of A), about which the marks turn (3, 4); then `marks` are their places where the valve is at
-    zero. None: rectangle and marks turn together.
+    zero, and `along` the directions of their longer sides (K, 3). None: rectangle and marks turn together.
     """
 
     size: list[float] = dc.field(default_factory=lambda: [0.098, 0.100])
     marks: np.ndarray = dc.field(default_factory=lambda: MARKS.copy())
     X_VA: np.ndarray | None = None
+    along: np.ndarray = dc.field(default_factory=lambda: np.zeros((0, 3)))
 
     @staticmethod
     def of(size: Sequence[float], radius: float = 0.15) -> "Marker":
@@ -41,6 +42,8 @@ class Marker:
         require(max(self.size) <= 3 * min(self.size), "marker.size", "of an aspect up to 3:1", self.size)
         places = self.marks.ndim == 2 and self.marks.shape[1] == 3 and bool(np.isfinite(self.marks).all())
         require(places, "marker.marks", "places (K, 3)", self.marks.tolist())
+        ways = self.X_VA is None or self.along.shape == self.marks.shape
+        require(ways, "marker.along", "a direction for each of marker.marks", self.along.tolist())
 
     def corners(self) -> np.ndarray:
         """(4, 3) in V [m], clockwise as seen by the camera."""

@@ -30,7 +30,7 @@ class View:
     lines: np.ndarray  # (4, 3)
     corners: np.ndarray  # (4, 2)
     green: np.ndarray  # (m, 2)
-    room: np.ndarray  # (m,) from each green mark's middle to the image's border [px]
+    room: np.ndarray  # (m, 4) from each green mark's middle to the image's left, upper, right, lower border [px]
     trust: np.ndarray  # (n,) 0..1: weight as a point of its own side
     information: np.ndarray  # (8, 8) of the nodes' distances [1/px^2], or zeros
 
@@ -97,11 +97,11 @@ def _view(
 
 
 def _room(points: np.ndarray, lens: LensModel) -> np.ndarray:
-    """From points (m, 2) to the nearest border of the image (m,) [px]."""
+    """From points (m, 2) to the left, upper, right and lower border of the image (m, 4) [px]."""
     if not len(points):
-        return np.zeros(0)
+        return np.zeros((0, 4))
     px = lens.project(points)
-    return np.minimum(px, np.array([lens.width, lens.height]) - 1.0 - px).min(1)
+    return np.hstack([px, np.array([lens.width, lens.height]) - 1.0 - px])
 
 
 def _robust_lines(

@@ -264,7 +264,9 @@ class Valve(Config):
         """What the head's cameras look for: the rectangle and the green marks, in V, with the stem at zero."""
         X_VA, up = self.X_VA(), np.array([0.0, 0.0, -self.marker.mark_height])
         marks = [X_VA[:, :3] @ (np.array(handle.xyz) + up) + X_VA[:, 3] for handle in self.handles]
-        return Marker(list(self.marker.size), np.round(np.array(marks), 12), X_VA if self.fixed else None)
+        along = [X_VA[:, :3] @ handle.direction() for handle in self.handles]
+        places = np.round(np.array(marks), 12)
+        return Marker(list(self.marker.size), places, X_VA if self.fixed else None, np.array(along))
 
     def grasp(self, handle: int, sign: float) -> np.ndarray:
         """X_AG of a hand at a handle -> (3, 4): z_G into the panel, x_G along the handle, its direction times `sign`.
