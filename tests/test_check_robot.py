@@ -11,11 +11,14 @@ import pytest
 from robot_facts import ROBOT
 from robot_variants import fixed, part, put, stiff_neck, variant, without_base_joints, without_gaze
 
-from valve_drake import cli, robot_check, robot_check_page, yaml_file
+from valve_drake import cli, named_files, robot_check, robot_check_page, yaml_file
 from valve_drake import scenario as scenarios
+from valve_drake.behaviors.valve_search import ValveSearchConfig
+from valve_drake.camera.lens import load_head
 from valve_drake.checks import ConfigError
 from valve_drake.robot import packages
 from valve_drake.robot_check import DOUBTFUL, MISSING, NOTE, Report
+from valve_drake.robot_sight import sees
 
 FEW = (0.8, 1.0)  # heights: a whole table takes long
 
@@ -153,6 +156,15 @@ def test_what_a_robot_lacks_is_said_with_its_key(case, tmp_path, monkeypatch):
     assert all("\n" not in line for line in robot_check_page.lines(report))
 
 
+@pytest.mark.parametrize("heading, seen", [(0.0, True), (1.0, True), (2.2, False), (np.pi, False)])
+def test_what_is_beside_or_behind_a_robot_is_not_seen(heading, seen):
+    """The neck turns to 1.55 rad; a point behind the eyes is projected into the image, too."""
+    head, points = load_head(named_files.find(scenarios.load(), "head_calibration")), np.zeros((4, 3)) + [0, 0, 1.0]
+    base = np.array([-1.5, 0.0, heading])
+    found = sees(ROBOT, head, ValveSearchConfig(), base, ROBOT.posture.home, points)
+    assert found == seen
+
+
 @pytest.mark.system
 def test_a_head_that_does_not_turn_sees_valves_of_some_heights_from_the_stance(tmp_path):
     path = variant(tmp_path, lambda model: stiff_neck(model, 0.6), without_gaze)
@@ -160,6 +172,7 @@ def test_a_head_that_does_not_turn_sees_valves_of_some_heights_from_the_stance(t
     upright = {row.height: row for row in report.reach if row.tilt == 0}
     assert upright[1.0].seen_to < 2 and np.isnan(upright[0.8].seen_to) and np.isnan(upright[1.3].seen_to)
     assert any("gaze.tilt: the eyes do not see the whole marker" in line for line in said(report, DOUBTFUL))
+    assert any("m from there back to 2 m" in finding.text for finding in report.findings)
     low = checked(path, "simulation.valve.height=0.75")
     assert any("at 0.75" in line and "from where its hands reach it" in line for line in said(low, MISSING))
     ours = checked("robot/robot.yaml")
