@@ -156,12 +156,16 @@ def test_what_a_robot_lacks_is_said_with_its_key(case, tmp_path, monkeypatch):
     assert all("\n" not in line for line in robot_check_page.lines(report))
 
 
-@pytest.mark.parametrize("heading, seen", [(0.0, True), (1.0, True), (2.2, False), (np.pi, False)])
-def test_what_is_beside_or_behind_a_robot_is_not_seen(heading, seen):
-    """The neck turns to 1.55 rad; a point behind the eyes is projected into the image, too."""
+@pytest.mark.parametrize(
+    "yaw, heading, seen", [(1.5, 0.0, True), (1.5, 1.0, True), (1.5, 2.2, False), (0.0, np.pi, False)]
+)
+def test_what_is_beside_or_behind_a_robot_is_not_seen(yaw, heading, seen):
+    """A point straight behind the eyes of a head that does not pan is projected into the image, too."""
     head, points = load_head(named_files.find(scenarios.load(), "head_calibration")), np.zeros((4, 3)) + [0, 0, 1.0]
     base = np.array([-1.5, 0.0, heading])
-    found = sees(ROBOT, head, ValveSearchConfig(), base, ROBOT.posture.home, points)
+    found = sees(
+        ROBOT, head, ValveSearchConfig(yaw_limit=yaw, sweep_yaw=min(yaw, 1.4)), base, ROBOT.posture.home, points
+    )
     assert found == seen
 
 
