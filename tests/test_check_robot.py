@@ -161,8 +161,8 @@ def test_what_a_robot_lacks_is_said_with_its_key(case, tmp_path, monkeypatch):
 )
 def test_what_is_beside_or_behind_a_robot_is_not_seen(yaw, heading, seen):
     """A point straight behind the eyes of a head that does not pan is projected into the image, too."""
-    head, points = load_head(named_files.find(scenarios.load(), "head_calibration")), np.zeros((4, 3)) + [0, 0, 1.0]
-    base = np.array([-1.5, 0.0, heading])
+    head, base = load_head(named_files.find(scenarios.load(), "head_calibration")), np.array([-1.5, 0.0, heading])
+    points = np.zeros((4, 3)) + [0, 0, ROBOT.X_BL(ROBOT.torso.home)[2, 3]]
     found = sees(
         ROBOT, head, ValveSearchConfig(yaw_limit=yaw, sweep_yaw=min(yaw, 1.4)), base, ROBOT.posture.home, points
     )
