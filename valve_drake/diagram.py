@@ -190,12 +190,13 @@ def robot_of(scenario: Scenario) -> Robot:
     return robot
 
 
-def gaze_of(scenario: Scenario) -> tuple[ValveSearchConfig, list[str]]:
+def gaze_of(scenario: Scenario, robot: Robot | None = None) -> tuple[ValveSearchConfig, list[str]]:
     """The search as the robot's joints can do it, and a line for each default that they cannot.
 
-    Raises ConfigError: a value that was chosen is beyond them.
+    robot: that of the scenario, where it is known, usable or not. Raises ConfigError: a value that was chosen is beyond
+    the joints.
     """
-    return _gaze(scenario.valve_search, robot_of(scenario))
+    return _gaze(scenario.valve_search, robot_of(scenario) if robot is None else robot)
 
 
 def _gaze(search: ValveSearchConfig, robot: Robot) -> tuple[ValveSearchConfig, list[str]]:

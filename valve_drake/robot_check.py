@@ -298,8 +298,9 @@ def _head(report: Report, robot: Robot, scenario: Scenario) -> None:
         text = f"{name} moves the eyes and is not named: give it as waist, pan or tilt, or hold it fast (weld)"
         report.add(DOUBTFUL, "search", "gaze", text)
     with contextlib.suppress(ConfigError):  # what a run refuses comes last
-        for line in gaze_of(scenario)[1]:
-            report.add(NOTE, "search", "", line)
+        for line in gaze_of(scenario, robot)[1]:
+            key, _, text = line.partition(": ")
+            report.add(NOTE, "search", key, text)
     if not (scenario.head_calibration or d.head_calibration):
         text = "none: there is no second eye without it, and the valve's place is measured with two (calibrate stereo)"
         report.add(MISSING, "search", "head_calibration", text)
@@ -507,7 +508,7 @@ def _seen_to(robot: Robot, scenario: Scenario, X_WA: np.ndarray, place: Place) -
     ends = [X_WA] if valve.fixed else [X_WA, turned(X_WA, TURN)]
     points = np.concatenate([apply(compose(X, valve.X_AV()), valve.target().corners()) for X in ends])
     try:
-        search = gaze_of(scenario)[0]
+        search = gaze_of(scenario, robot)[0]
     except ConfigError:  # what a run refuses comes last
         search = scenario.valve_search
     posture = robot.posture.home if place.posture is None else place.posture
