@@ -4,6 +4,7 @@ LOG: the log of a run that is there already; without it one is made.
 """
 
 import collections
+import contextlib
 import importlib.util
 import json
 import os
@@ -14,6 +15,8 @@ import sys
 from pathlib import Path
 
 import pytest
+import zstandard
+from mcap.reader import make_reader
 
 from valve_drake import runner
 from valve_drake import scenario as scenarios
@@ -42,10 +45,20 @@ def counts(log):
 
 @pytest.fixture
 def flipped(log, tmp_path):
+    """The log with a bit turned over within a chunk's messages, so that it can be unpacked and its CRC alone tells."""
     data = bytearray(log.path.read_bytes())
-    data[len(data) // 2] ^= 1
-    (tmp_path / "flipped.mcap").write_bytes(data)
-    return tmp_path / "flipped.mcap"
+    with open(log.path, "rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    for chunk in chunks[len(chunks) // 2 :]:
+        end = chunk.chunk_start_offset + chunk.chunk_length
+        start, at = end - chunk.compressed_size, end - chunk.compressed_size // 2
+        data[at] ^= 1
+        with contextlib.suppress(zstandard.ZstdError):
+            zstandard.decompress(bytes(data[start:end]), chunk.uncompressed_size)
+            (tmp_path / "flipped.mcap").write_bytes(data)
+            return tmp_path / "flipped.mcap"
+        data[at] ^= 1
+    raise AssertionError("no chunk can be unpacked with a bit turned over")
 
 
 @pytest.fixture(scope="module")
