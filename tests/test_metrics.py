@@ -10,7 +10,7 @@ from robot_facts import GROUPS
 from valve_drake.analysis import integrity
 from valve_drake.analysis.metrics import summarize
 from valve_drake.analysis.traces import Traces, interpolate
-from valve_drake.messages import Cause, Mode, ModeState, Status
+from valve_drake.messages import Mode, ModeState
 from valve_drake.recording.reader import LogReader
 from valve_drake.recording.recorder_system import ONCE
 from valve_drake.recording.schemas import Vector
@@ -44,22 +44,6 @@ def test_modes_with_their_durations_attempts_and_reasons(summary):
     assert summary.spans[0].duration == 1.0 and summary.spans[-1].end == pytest.approx(6.0, abs=0.01)
     assert summary.retries == 1
     assert summary.mode_durations()["servo"] == 1.0
-
-
-@pytest.mark.parametrize("turn, retries", [("succeeded", 0), ("failed", 3)])
-def test_a_further_grasp_that_the_turn_needs_is_no_retry_and_one_after_a_lost_hold_is(tmp_path, turn, retries):
-    story = ("measure", "turn", "verify", "measure", "turn", "verify", "done")
-    with LogWriter(tmp_path / "run.mcap") as writer:
-        for k, mode in enumerate(story):
-            state = ModeState(time=float(k), mode=mode, activation=k, since=float(k), attempt=k // 3)
-            writer.write("/supervisor/mode", state, float(k))
-        writer.write("/hybrid_rotation/status", Status(1.5, 1, turn), 1.5)
-        look = Status(2.5, 2, "failed", "reach_limit", cause=Cause.REGRASP.value, seen=True, value=0.9)
-        writer.write("/kinematic_approach/status", look, 2.5)
-    summary = summarize(tmp_path / "run.mcap")
-    assert [span.mode for span in summary.spans] == list(story)
-    assert summary.retries == retries
-    assert summary.angle_camera_rad == 0.9
 
 
 def test_a_log_of_before_the_field_seen_shows_the_cameras_angle_too(tmp_path):

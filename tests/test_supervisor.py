@@ -253,6 +253,25 @@ def test_attempt_counts_the_retries_of_a_mode():
     assert attempts == [0, 1, 2]
 
 
+@pytest.mark.parametrize("turn, attempts", [("succeeded", [0, 0, 0]), ("failed", [0, 1, 2])])
+def test_a_further_grasp_that_a_long_turn_needs_is_no_retry_and_one_after_a_lost_hold_is(turn, attempts):
+    bench, left, seen = bring_to(Mode.TURN), [2], [0]
+
+    def each(s):
+        if s.mode == Mode.TURN and turn == "failed" and left[0] > 0:
+            return {OWNER[s.mode]: {"state": "failed", "verdict": "slip"}}
+        if s.mode == Mode.VERIFY and left[0] > 0:
+            left[0] -= 1
+            return {OWNER[s.mode]: {"state": "failed", "verdict": "reach_limit", "cause": "regrasp"}}
+        return {OWNER[s.mode]: {"state": "succeeded"}}
+
+    while bench.state.mode not in TERMINAL:
+        bench.tick(each)
+        if bench.state.mode == Mode.TURN:
+            seen.append(bench.state.message(0.0, CONFIG).attempt)
+    assert seen == attempts and bench.state.verdict == Verdict.TURNED
+
+
 @pytest.mark.parametrize("mode", WATCHED)
 def test_a_marker_lost_on_the_way_is_searched_again(mode):
     bench = bring_to(mode)

@@ -408,7 +408,7 @@ class ModeState(Message):
     mode: str = Mode.IDLE.value
     activation: int = 0
     since: float = 0.0  # when this mode was entered [s]
-    attempt: int = 0  # retries of this mode so far
+    attempt: int = 0  # retries of this mode so far, with the present grasp
     turn_angle: float = 0.0  # commanded turn, counter-clockwise for the robot [rad]
     verdict: str = Verdict.NONE.value
     reason: str = ""

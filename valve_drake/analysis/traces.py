@@ -13,7 +13,7 @@ import numpy as np
 
 from valve_drake.checks import ConfigError
 from valve_drake.frames import compose, inverse, make, rot_z, rotation_vector, wrap
-from valve_drake.messages import SIDES, Cause, Mode
+from valve_drake.messages import SIDES, Mode
 from valve_drake.recording.reader import LogReader, Record
 from valve_drake.recording.tables import Table
 from valve_drake.robot.groups import GROUPS
@@ -28,7 +28,6 @@ SCHEMAS = {  # of the topics that are read here
     "/rectangle_estimator/estimate": "valve_drake.RectangleEstimate",
     "/stereo_positioning/position": "valve_drake.StereoPosition",
     "/hybrid_rotation/turn": "valve_drake.TurnState",
-    "/hybrid_rotation/status": "valve_drake.Status",
     "/image_servo/servo": "valve_drake.ServoState",
     "/health": "valve_drake.Health",
     "/command_selector/report": "valve_drake.SelectorReport",
@@ -49,11 +48,7 @@ HALF_TURN = make(rot_z(np.pi), np.zeros(3))
 
 @dc.dataclass(frozen=True)
 class ModeSpan:
-    """One stay in a mode. `reason` is why it was entered.
-
-    attempt: how often the mode was entered before, with the present grasp. A turn that takes several grasps goes
-    through the same modes again, by plan: that is no retry.
-    """
+    """One stay in a mode. `reason` is why it was entered, `attempt` counts the entries before it."""
 
     mode: str
     activation: int
@@ -204,23 +199,7 @@ class Traces:
             self.missing["modes"] = f"change {len(starts)} times: the first {MOST_SPANS} are shown"
             starts = starts[:MOST_SPANS]
         ends = [mode.since for mode in starts[1:]] + [self.reader.end]
-        further = {m.activation for m in self._looks if m.cause == Cause.REGRASP}
-        turned = {m.activation for _, m in self._messages("/hybrid_rotation/status") if m.state == "succeeded"}
-        spans: list[ModeSpan] = []
-        entered: list[str] = []
-        for mode, end in zip(starts, ends):
-            if spans and spans[-1].activation in further:
-                turn = next((span for span in reversed(spans) if span.mode == Mode.TURN), None)
-                if turn is not None and turn.activation in turned:  # else the hands had lost hold
-                    entered.clear()
-            spans.append(ModeSpan(mode.mode, mode.activation, mode.since, end, mode.reason, entered.count(mode.mode)))
-            entered.append(mode.mode)
-        return spans
-
-    @functools.cached_property
-    def _looks(self) -> list[Any]:
-        """What kinematic_approach reported."""
-        return [status for _, status in self._messages("/kinematic_approach/status")]
+        return [ModeSpan(m.mode, m.activation, m.since, end, m.reason, m.attempt) for m, end in zip(starts, ends)]
 
     @_Trace
     def joints(self) -> Joints | None:
@@ -440,7 +419,7 @@ class Traces:
         """The valve's angle by the cameras after the hands have let go [rad]; None if it was not measured."""
         verifying = {span.activation for span in self.spans if span.mode == Mode.VERIFY}
         angle = None
-        for status in self._looks:
+        for _, status in self._messages("/kinematic_approach/status"):
             # A log of a program that had no `seen` says so by its progress.
             if status.activation in verifying and (status.seen or status.progress == 1.0):
                 angle = status.value

@@ -33,6 +33,7 @@ from valve_drake.memory import changed
 from valve_drake.messages import (
     CAMERAS,
     DEVICES,
+    Cause,
     Health,
     Mode,
     ModeState,
@@ -97,6 +98,8 @@ class State:
     sequence: int = -1  # of the last operator command taken
     after_release: Mode = Mode.FOLD  # where release leads
     entered: tuple[Mode, ...] = ()  # modes of this run, in order
+    grasp: int = 0  # which of them the present grasp begins with; a further one that a long turn needs is no retry
+    lost: bool = False  # the last turn failed: then the next grasp is a retry
     retried: tuple[str, ...] = ()  # what failed and was tried again in this run
     held_at: float = math.inf  # since when the operator holds the turn; infinite: he does not [s]
     held_for: float = 0.0  # for how long he did so in this mode, before [s]
@@ -113,7 +116,7 @@ class State:
             mode=self.mode.value,
             activation=self.activation,
             since=self.since,
-            attempt=max(self.entered.count(self.mode) - 1, 0),
+            attempt=max(self.entered[self.grasp :].count(self.mode) - 1, 0),
             turn_angle=self.turn_angle,
             verdict=self.verdict.value,
             reason=self.reason,
@@ -218,6 +221,8 @@ def _enter(s: State, time: float, mode: Mode, reason: str, **changes: Any) -> St
     """A new activation."""
     if mode == Mode.FINE_APPROACH:
         changes = {"near": True} | changes
+    if mode == Mode.TURN:
+        changes = {"lost": False} | changes
     if s.held:
         began = s.began + time - s.held_at  # the run's own deadline did not run either
         changes = {"began": began, "held_at": time if mode in HOLDS else math.inf} | changes
@@ -304,7 +309,9 @@ def _fail(config: SupervisorConfig, s: State, time: float, block: str, status: S
     retry = TABLE[s.mode].retry_of(status.cause, verdict)
     if retry is None or s.verdict or s.retried.count(retry.limit) >= config.retries[retry.limit]:
         return _give_up(s, time, verdict, reason)
-    s = changed(s, retried=(*s.retried, retry.limit))
+    s = changed(s, retried=(*s.retried, retry.limit), lost=s.lost or s.mode == Mode.TURN)
+    if status.cause == Cause.REGRASP and not s.lost:
+        s = changed(s, grasp=len(s.entered))
     if retry.mode == Mode.SEARCH and s.near:  # from close by the marker may be out of the cameras' view
         return _enter(s, time, Mode.FOLD, reason, clearing=True)
     return _enter(s, time, retry.mode, reason, after_release=retry.after_release or Mode.FOLD)
