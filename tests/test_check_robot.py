@@ -249,7 +249,7 @@ REAL = {
     "baxter": (
         BAXTER,
         [
-            (NOTE, "search gaze.tilt: none: the head does not turn, the search looks at one height"),
+            (NOTE, "search gaze.tilt: none: the head does not turn up or down"),
             (NOTE, "approach base.drive: fixed"),
             (DOUBTFUL, "grasp opening: the fingers open by 42 mm"),
             (MISSING, "grasp : opening must be wider, or frames."),

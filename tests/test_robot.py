@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
-from robot_facts import MIRROR, ROBOT, robot_state
+from robot_facts import MIRROR, ROBOT
 from robot_variants import (
     fixed,
     part,
@@ -322,15 +322,12 @@ def test_a_head_that_turns_the_other_way_looks_where_it_is_asked_to(tmp_path):
 
     scenario = load(None, [f"robot={variant(tmp_path, edit)}"])
     robot = Robot.load(scenario.robot)
-    assert ROBOT.gaze_signs.tolist() == [1, 1, 1] and robot.gaze_signs.tolist() == [-1, -1, -1]
-    search, ours = (
-        next(block for block in make_blocks(s) if block.get_name() == "valve_search") for s in (scenario, load())
-    )
+    assert ROBOT.gaze.signs.tolist() == [1, 1, 1] and robot.gaze.signs.tolist() == [-1, -1, -1]
     gaze = np.array([0.3, 0.4, -0.5])  # waist to the left, down, to the right
-    torso = search._torso(gaze, np.zeros(1))
-    assert torso.tolist() == [-0.3, -0.4, 0.5] and ours._torso(gaze, np.zeros(1)) == pytest.approx(gaze)
+    torso = robot.gaze.torso(gaze, np.zeros(1))
+    assert torso.tolist() == [-0.3, -0.4, 0.5] and ROBOT.gaze.torso(gaze, np.zeros(1)) == pytest.approx(gaze)
     assert robot.X_BL(torso) == pytest.approx(ROBOT.X_BL(gaze))
-    assert search._seen(robot_state(torso=torso)).torso == pytest.approx(gaze)
+    assert robot.gaze.of(torso) == pytest.approx(gaze) and ROBOT.gaze.plain and not robot.gaze.plain
     up = load(None, [f"robot={tmp_path / 'robot.yaml'}", "valve_search.pitch_high=1.1", "valve_search.pitch_low=-0.5"])
     make_blocks(up)  # its limits are those of the joint, turned about
 
@@ -607,7 +604,7 @@ def test_a_head_that_does_not_turn_looks_where_it_is_mounted(tmp_path):
     path = variant(tmp_path, lambda model: stiff_neck(model, 0.4), without_gaze)
     scenario = load(None, [f"robot={path}"])
     robot = Robot.load(path)
-    assert robot.gaze == (0, None, None) and robot.torso.names == ("waist",) and robot.groups.absent == ()
+    assert robot.gaze.joints == (0, None, None) and robot.torso.names == ("waist",) and robot.groups.absent == ()
     assert robot.held(np.array([0.3])).tolist() == [0.3]
     search, lines = gaze_of(scenario)
     assert (search.pitches, search.pitch_high, search.yaw_limit, search.sweep_yaw) == ([0.0], 0.0, 0.0, 0.0)

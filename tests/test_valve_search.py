@@ -16,10 +16,11 @@ from valve_drake.frames import apply, inverse, make
 from valve_drake.messages import Cause, Mode, ModeState, RectangleEstimate, RobotState, StereoPosition, Verdict
 from valve_drake.ports import TICK
 from valve_drake.robot.drive import DIFFERENTIAL, drive
+from valve_drake.robot.gaze import Gaze
 
 DT = 1 / 64  # half the real rate: the laws do not depend on it, and the tests are quicker
 CONFIG = ValveSearchConfig()
-HEAD = ROBOT.head_pose
+HEAD, GAZE = ROBOT.head_pose, ROBOT.gaze
 VIEW = (np.deg2rad(14.5), np.deg2rad(11))  # half the field of the narrower camera
 BASELINE = 0.12
 
@@ -519,13 +520,13 @@ def test_a_marker_that_a_stiff_neck_cannot_face_is_not_lost_while_the_base_drive
 def rig(**inputs) -> Rig:
     robot = robot_state(time=0.0)
     return Rig(
-        ValveSearchSystem(CONFIG, HEAD, np.zeros(3), (0, 1, 2)),
+        ValveSearchSystem(CONFIG, HEAD, GAZE),
         **{"robot_state": robot, "mode": ModeState(mode="search", activation=1)} | inputs,
     )
 
 
 def test_ports():
-    assert ports(ValveSearchSystem(CONFIG, HEAD, np.zeros(3), (0, 1, 2))) == {
+    assert ports(ValveSearchSystem(CONFIG, HEAD, GAZE)) == {
         "robot_state": "in abstract",
         "mode": "in abstract",
         "position": "in abstract",
@@ -546,7 +547,7 @@ def test_joints_that_a_head_lacks_are_not_commanded_and_count_as_zero(rest, gaze
         assert torso.shape == rest.shape
         return HEAD(base, np.array([0.0 if joint is None else torso[joint] for joint in gaze]))
 
-    block = ValveSearchSystem(CONFIG, head, rest, gaze)
+    block = ValveSearchSystem(CONFIG, head, Gaze(gaze, rest))
     seen = block._seen(robot_state(torso=rest)).torso
     assert seen.tolist() == [0.0 if joint is None else rest[joint] for joint in gaze]
     dut = Rig(
@@ -572,7 +573,7 @@ def test_a_lift_stays_where_it_rests_and_a_robot_without_a_waist_turns_its_head_
         return HEAD(base, np.array([0.0 if waist is None else torso[waist], *torso[-2:]]))
 
     dut = Rig(
-        ValveSearchSystem(CONFIG, head, rest, (waist, len(rest) - 2, len(rest) - 1)),
+        ValveSearchSystem(CONFIG, head, Gaze((waist, len(rest) - 2, len(rest) - 1), rest)),
         robot_state=robot_state(torso=rest, history=np.zeros((1, 4 + len(rest)))),
         mode=ModeState(mode="search", activation=1),
     )
@@ -612,7 +613,7 @@ def test_block_refuses_a_wrong_message_and_needs_the_mode():
     with pytest.raises(TypeError, match="want StereoPosition"):
         rig(position=RectangleEstimate()).run(0.1)
     with pytest.raises(RuntimeError, match="mode.*valve_search.*nothing is connected"):
-        Rig(ValveSearchSystem(CONFIG, HEAD, np.zeros(3), (0, 1, 2)), robot_state=robot_state()).run(0.1)
+        Rig(ValveSearchSystem(CONFIG, HEAD, GAZE), robot_state=robot_state()).run(0.1)
 
 
 @pytest.mark.parametrize(
@@ -628,4 +629,4 @@ def test_block_refuses_a_wrong_message_and_needs_the_mode():
 )
 def test_bad_config_is_refused_by_name(changes, words):
     with pytest.raises(ConfigError, match=words):
-        ValveSearchSystem(ValveSearchConfig(**changes), HEAD, np.zeros(3), (0, 1, 2))
+        ValveSearchSystem(ValveSearchConfig(**changes), HEAD, GAZE)

@@ -201,12 +201,12 @@ def gaze_of(scenario: Scenario, robot: Robot | None = None) -> tuple[ValveSearch
 
 def _gaze(search: ValveSearchConfig, robot: Robot) -> tuple[ValveSearchConfig, list[str]]:
     limits = list(zip(robot.torso.low.tolist(), robot.torso.high.tolist()))
-    waist, tilt, pan = (None if joint is None else limits[joint] for joint in robot.gaze)
+    waist, tilt, pan = (None if joint is None else limits[joint] for joint in robot.gaze.joints)
 
     def both(limit: tuple[float, float]) -> float:
         return max(min(-limit[0], limit[1]), 0.0)
 
-    pitch = tilt if tilt is None or robot.gaze_signs[1] > 0 else (-tilt[1], -tilt[0])
+    pitch = tilt if tilt is None or robot.gaze.signs[1] > 0 else (-tilt[1], -tilt[0])
     return reachable(search, GazeLimits(pitch, pan and both(pan), waist and both(waist)))
 
 
@@ -350,9 +350,7 @@ def make_blocks(scenario: Scenario) -> list[Block[Any, Any]]:
         ValveSearchSystem(
             _gaze(scenario.valve_search, robot)[0],
             lambda base, torso: compose(robot.head_pose(base, torso), X_LEyes),
-            robot.torso.home,
             robot.gaze,
-            robot.gaze_signs,
             look=valve.look(),
             drive=robot.drive,
             sight=_sight(head),

@@ -35,7 +35,7 @@ from valve_drake.robot import description as descriptions
 from valve_drake.robot.kinematics import Joints
 from valve_drake.robot.model import add_robot, parent_joint
 from valve_drake.robot.portrait import Studio, png
-from valve_drake.robot.robot import Robot
+from valve_drake.robot.robot import Robot, carriers
 from valve_drake.robot_postures import Postures, find_home, find_work
 from valve_drake.robot_sight import seen_from
 from valve_drake.scenario import Scenario
@@ -43,7 +43,7 @@ from valve_drake.stations.scene import add_scene, panel_pose
 from valve_drake.stations.servos import add_servos
 from valve_drake.stations.simulation_config import ValveConfig
 from valve_drake.teaching import made_for
-from valve_drake.valve.valve import turned
+from valve_drake.valve.valve import Valve, turned
 
 HEIGHTS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3)  # of the valve's axis [m]
 TILTS = (-0.3, 0.0, 0.3)  # of the panel; positive leans away at its top [rad]
@@ -66,7 +66,6 @@ OUTER = 3  # arm joints from the shoulder on whose links may touch the trunk at 
 FIELD = 1.0  # upright, of an eye whose lens is not known [rad]
 EYE = 320, 240  # of an eye's picture [px]
 BEHIND = np.array([-0.75, 0.65, 0.35]), np.array([-0.45, -0.75, 0.6])  # views of a robot at the valve
-COMES = 2.0  # base to panel where the fine approach begins [m]
 SAMPLES = 7  # of the turn at which efforts are looked at
 NIGHT = (1.0, 0.0, 1.0)  # a sky in a colour that no robot has
 
@@ -128,7 +127,6 @@ class Report:
     reach: list[Reach] = dc.field(default_factory=list)
     least_margin: float = 0.0
     friction: float = 0.0  # of the valve for which efforts are given [N m]
-    has_head: bool = False  # its calibration is there
     hidden: dict[str, float] = dc.field(default_factory=dict)  # by eye, share of its image's middle
     pictures: dict[str, bytes] = dc.field(default_factory=dict)
     seconds: float = 0.0  # of processor time
@@ -181,10 +179,9 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
         report.seconds = time.process_time() - start
         return report
     _groups(report, robot)
-    report.has_head = _head_of(scenario) is not None
     _head(report, robot, scenario)
     _base(report, robot)
-    collision = CollisionModel(robot)
+    head, collision = _head_of(scenario), CollisionModel(robot)
     _home(report, robot, collision)
     refused = ""
     try:
@@ -196,10 +193,12 @@ def check(scenario: Scenario, source: str, *, pictures: bool = False) -> Report:
     _grippers(report, robot, scenario)
     _servos(report, robot)
     report.friction = _most(scenario.simulation.valve.friction)
-    best = None if refused else _reach(report, robot, scenario, collision)  # no hand holds it: nothing to reach for
-    _eyes(report, robot, scenario, best, pictures)
+    best = (
+        None if refused else _reach(report, robot, scenario, collision, head)
+    )  # no hand holds it: nothing to reach for
+    _eyes(report, robot, scenario, best, head, pictures)
     if not refused:
-        _postures(report, robot, scenario, collision)
+        _postures(report, robot, scenario, collision, head)
     _rest(report, scenario)
     report.seconds = time.process_time() - start
     return report
@@ -315,12 +314,8 @@ def _unnamed(robot: Robot) -> list[str]:
     """Joints that carry the left eye and move, and that robot.yaml does not name."""
     plant, index = robot.model.plant, robot.model.robot
     named = {*robot.base.names, *robot.torso.names, *(mimic.joint for mimic in robot.model.mimics)}
-    body, out = plant.GetFrameByName(robot.description.cameras["head_left"], index).body(), []
-    while (joint := parent_joint(plant, index, body)) is not None:
-        if joint.num_velocities() and joint.name() not in named:
-            out.append(joint.name())
-        body = joint.parent_body()
-    return out
+    carry = carriers(plant, index, plant.GetFrameByName(robot.description.cameras["head_left"], index))
+    return [joint.name() for joint in carry if joint.num_velocities() and joint.name() not in named]
 
 
 def _calibration(scenario: Scenario) -> StereoHead:
@@ -465,7 +460,9 @@ def _servos(report: Report, robot: Robot) -> None:
 # ---------------------------------------------------------------- reach
 
 
-def _reach(report: Report, robot: Robot, scenario: Scenario, collision: CollisionModel) -> Best | None:
+def _reach(
+    report: Report, robot: Robot, scenario: Scenario, collision: CollisionModel, head: StereoHead | None
+) -> Best | None:
     """Fills the table."""
     spec, stances = scenario.stance, _stances(robot, scenario, collision)
     fixed = scenario.simulation.valve
@@ -473,6 +470,10 @@ def _reach(report: Report, robot: Robot, scenario: Scenario, collision: Collisio
     rows = [(height, 0.0) for height in sorted({*HEIGHTS, *own})]
     rows += [(height, tilt) for height in HEIGHTS[1::2] for tilt in TILTS if tilt]
     best: tuple[float, ValveConfig, Place] | None = None
+    try:
+        search = gaze_of(scenario, robot)[0]
+    except ConfigError:  # what a run refuses comes last
+        search = scenario.valve_search
     start = time.process_time()
     for k, (height, tilt) in enumerate(rows):
         if time.process_time() - start > BUDGET:
@@ -489,30 +490,22 @@ def _reach(report: Report, robot: Robot, scenario: Scenario, collision: Collisio
         effort, joint = _effort(report, robot, stances, X_BA, place)
         distance = float(np.linalg.norm(place.base[:2]))
         posture = () if place.posture is None else tuple(round(float(q), 4) for q in place.posture)
-        seen_to = _seen_to(robot, scenario, X_WA, place)
+        seen_to = math.nan if head is None else seen_from(robot, head, search, place, _marker(scenario.valve, X_WA))
         report.reach.append(Reach(height, tilt, margin, distance, posture, effort, joint, seen_to))
         if tilt == 0 and (best is None or margin > best[0]):
             best = margin, valve, place
-    _judge_reach(report, spec, own, not robot.drive.fixed)
+    _judge_reach(report, spec, own)
+    if head is not None:
+        _judge_sight(report, scenario, own, not robot.drive.fixed)
     if best is None or best[0] < spec.margin_min:
         _in_the_way(report, stances, collision)
     return None if best is None else best[1:]
 
 
-def _seen_to(robot: Robot, scenario: Scenario, X_WA: np.ndarray, place: Place) -> float:
-    """How far back from a stance the head sees the whole marker, before the turn and after it [m]; NaN: not there."""
-    head = _head_of(scenario)
-    if head is None:
-        return math.nan
-    valve = scenario.valve
+def _marker(valve: Valve, X_WA: np.ndarray) -> np.ndarray:
+    """The marker's corners before the turn and after it, in W (n, 3)."""
     ends = [X_WA] if valve.fixed else [X_WA, turned(X_WA, TURN)]
-    points = np.concatenate([apply(compose(X, valve.X_AV()), valve.target().corners()) for X in ends])
-    try:
-        search = gaze_of(scenario, robot)[0]
-    except ConfigError:  # what a run refuses comes last
-        search = scenario.valve_search
-    posture = robot.posture.home if place.posture is None else place.posture
-    return seen_from(robot, head, search, place.base, posture, points)
+    return np.concatenate([apply(compose(X, valve.X_AV()), valve.target().corners()) for X in ends])
 
 
 def _in_the_way(report: Report, stances: Stances, collision: CollisionModel) -> None:
@@ -563,7 +556,7 @@ def _views(scenario: Scenario) -> Mapping[str, np.ndarray]:
         return dict.fromkeys(SIDES, np.array([0.0, 0.0, 1.0]))
 
 
-def _judge_reach(report: Report, spec: StanceConfig, own: set[float], drives: bool) -> None:
+def _judge_reach(report: Report, spec: StanceConfig, own: set[float]) -> None:
     upright = [row for row in report.reach if row.tilt == 0]
     good = [row for row in upright if row.serves(spec.margin_min)]
     weak = [row for row in upright if row.margin >= spec.margin_min and row.effort > DEAR]
@@ -577,7 +570,6 @@ def _judge_reach(report: Report, spec: StanceConfig, own: set[float], drives: bo
         report.add(MISSING, "reach", "arms.*.work", text)
         return
     served = {round(row.height, 3) for row in good}
-    _judge_sight(report, good, own, drives)
     out = [row.height for row in upright if round(row.height, 3) not in served]
     if lost := sorted(own - served):
         # One height: that is the valve of this scenario. Several: it is drawn, and most may be in reach.
@@ -587,20 +579,19 @@ def _judge_reach(report: Report, spec: StanceConfig, own: set[float], drives: bo
         report.add(NOTE, "reach", "", f"valves at {', '.join(f'{h:g}' for h in out)} m are out of reach")
 
 
-def _judge_sight(report: Report, good: list[Reach], own: set[float], drives: bool) -> None:
+def _judge_sight(report: Report, scenario: Scenario, own: set[float], drives: bool) -> None:
     """Whether the head sees the valves that the hands reach: from the stance, and on the way there."""
-    if not report.has_head:
-        return
-    key = "gaze.tilt"
+    good = [row for row in report.reach if row.tilt == 0 and row.serves(scenario.stance.margin_min)]
+    comes = scenario.base_approach.rough_distance
     blind = [row for row in good if math.isnan(row.seen_to)]
-    late = [row for row in good if row.seen_to < COMES if drives]
-    for rows, where in (blind, "from where its hands reach it"), (late, f"from there back to {COMES:g} m"):
+    late = [row for row in good if drives and row.seen_to < comes]
+    for rows, where in (blind, "from where its hands reach it"), (late, f"from there back to {comes:g} m"):
         if not rows:
             continue
         heights = sorted({row.height for row in rows})
         text = f"the eyes do not see the whole marker of a valve at {', '.join(f'{h:g}' for h in heights)} m {where}"
         mine = own & {round(height, 3) for height in heights}
-        report.add(MISSING if mine == own else DOUBTFUL if mine else NOTE, "search", key, text)
+        report.add(MISSING if mine == own else DOUBTFUL if mine else NOTE, "search", "gaze.tilt", text)
 
 
 def _effort(report: Report, robot: Robot, stances: Stances, X_BA: np.ndarray, place: Place) -> tuple[float, str]:
@@ -645,9 +636,10 @@ def _limits(plant: MultibodyPlant) -> dict[str, float]:
 # ---------------------------------------------------------------- eyes and pictures
 
 
-def _eyes(report: Report, robot: Robot, scenario: Scenario, best: Best | None, pictures: bool) -> None:
+def _eyes(
+    report: Report, robot: Robot, scenario: Scenario, best: Best | None, head: StereoHead | None, pictures: bool
+) -> None:
     """What of the robot itself its eyes see, arms folded; and pictures of it."""
-    head = _head_of(scenario)
     report.hidden = _hidden(robot, scenario, head)
     worst = max(report.hidden.values())
     if worst > HIDDEN:
@@ -689,7 +681,9 @@ def _hidden(robot: Robot, scenario: Scenario, head: StereoHead | None) -> dict[s
     return out
 
 
-def _postures(report: Report, robot: Robot, scenario: Scenario, collision: CollisionModel) -> None:
+def _postures(
+    report: Report, robot: Robot, scenario: Scenario, collision: CollisionModel, head: StereoHead | None
+) -> None:
     """Others to copy, where those of robot.yaml do not serve: work for a poor reach, home where it is in the way."""
     spec = scenario.stance
     work: Postures = {side: arm.work.tolist() for side, arm in robot.arms.items()}
@@ -711,7 +705,6 @@ def _postures(report: Report, robot: Robot, scenario: Scenario, collision: Colli
     zero = not all(np.any(arm.home) for arm in robot.arms.values())
     if not zero and max(report.hidden.values()) <= HIDDEN and not collision.touching(None, robot.home):
         return
-    head = _head_of(scenario)
 
     def serves(other: Robot) -> bool:
         outer = {link: k for side in SIDES for link, k in _links(other, side).items()}
@@ -737,11 +730,7 @@ def _share(image: np.ndarray) -> float:
 
 def _gaze(robot: Robot, pitch: float, pan: float) -> np.ndarray:
     """The torso's joints for a look down and to the left, within their limits."""
-    torso, d = robot.torso.home.copy(), robot.description.gaze
-    for name, value, sign in ((d.tilt, pitch, robot.gaze_signs[1]), (d.pan, pan, robot.gaze_signs[2])):
-        if name:
-            torso[robot.torso.names.index(name)] = sign * value
-    within: np.ndarray = np.clip(torso, robot.torso.low, robot.torso.high)
+    within: np.ndarray = np.clip(robot.gaze.torso(np.array([0.0, pitch, pan])), robot.torso.low, robot.torso.high)
     return within
 
 

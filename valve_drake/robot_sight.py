@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from valve_drake.behaviors.valve_search import ValveSearchConfig, aim
+from valve_drake.behaviors.stance_search import Place
+from valve_drake.behaviors.valve_search import ValveSearchConfig, aim, neck
 from valve_drake.camera.lens import StereoHead
 from valve_drake.frames import apply, compose, inverse, make
 from valve_drake.robot.robot import Robot
@@ -19,28 +20,20 @@ def sees(
 ) -> bool:
     """Whether both eyes have all `points` (n, 3) in their images, the gaze at the middle of them as far as it goes.
 
-    base: x, y, heading. search: as the robot's joints can do it. The waist stays at home.
+    base: x, y, heading. search: as the robot's joints can do it. posture: lift and waist.
     """
-    rest = robot.torso.home.copy()
-    rest[: len(posture)] = posture
     X_LEyes = make(np.eye(3), head.X_LR[:, 3] / 2)
+    gaze = robot.gaze.of(np.concatenate([posture, robot.torso.home[len(posture) :]]))
 
-    def torso(pitch: float, yaw: float) -> np.ndarray:
-        out = rest.copy()
-        for joint, angle in zip(robot.gaze[1:], robot.gaze_signs[1:] * [pitch, yaw]):
-            if joint is not None:
-                out[joint] = angle
-        return out
+    def head_pose(base: np.ndarray, gaze: np.ndarray) -> np.ndarray:
+        return robot.head_pose(base, robot.gaze.torso(gaze, posture))
 
-    pitch = yaw = 0.0
     for _ in range(STEPS):
-        way = aim(lambda b, gaze: compose(robot.head_pose(b, torso(*gaze[1:])), X_LEyes), base,
-                  np.array([0.0, pitch, yaw]), points.mean(axis=0))  # fmt: skip
-        pitch = min(max(way[0], search.pitch_low), search.pitch_high)
-        yaw = min(max(way[1], -search.yaw_limit), search.yaw_limit)
-    X_BL = robot.head_pose(base, torso(pitch, yaw))
+        way = aim(lambda base, gaze: compose(head_pose(base, gaze), X_LEyes), base, gaze, points.mean(axis=0))
+        gaze = np.array([gaze[0], *neck(search, *way)])
+    X_OL = head_pose(base, gaze)
     for lens, X_LC in zip(head.lenses(), (np.eye(3, 4), head.X_LR)):
-        P = apply(inverse(compose(X_BL, X_LC)), points)
+        P = apply(inverse(compose(X_OL, X_LC)), points)
         if P[:, 2].min() <= 0.0:
             return False
         px = lens.project(P[:, :2] / P[:, 2:])
@@ -53,12 +46,12 @@ def seen_from(
     robot: Robot,
     head: StereoHead,
     search: ValveSearchConfig,
-    base: np.ndarray,
-    posture: np.ndarray,
+    place: Place,
     points: np.ndarray,
 ) -> float:
-    """From the stance `base` (x, y, heading; the panel at the origin) straight back, how far the head sees `points`
-    without a gap, base to panel [m]; NaN where it does not see them from the stance. A fixed robot stays there."""
+    """From a stance (the panel at the origin) straight back, how far the head sees `points` (n, 3) without a gap, base
+    to panel [m]; NaN where it does not see them from the stance. A fixed robot stays there."""
+    base, posture = place.base, robot.posture.home if place.posture is None else place.posture
     near = float(np.linalg.norm(base[:2]))
     if not sees(robot, head, search, base, posture, points):
         return math.nan

@@ -356,20 +356,18 @@ def _fine(
         if time - m.since > config.stance_patience and not under_way:
             return _end(m, "failed", Verdict.REACH_LIMIT, stance.reason or "no stance: the marker's pose is not known")
         return changed(m, detail="waiting for a stance"), STILL
-    goal, panel, keep = m.stance.median, m.panel.median, 0.0
-    if np.isnan(panel[2]):  # an upright axis: a plane behind its post, facing the stance
-        stem, keep = panel[:2], config.clearance + math.hypot(valve.panel.width, valve.panel.height) / 2
-        panel = np.array([*_ahead(np.array([*stem, goal[2]]), SLIM), goal[2]])
+    base, goal, panel = state.odometry[:3], m.stance.median, m.panel.median
+    there, upright = _pre_stance(config, goal), bool(np.isnan(panel[2]))
+    if upright:  # round its post, and a plane behind it that faces the stance
+        corners = math.hypot(valve.panel.width, valve.panel.height) / 2
+        there = _round(base[:2], there, panel[:2], config.clearance + corners)
+        panel = np.array([*_ahead(np.array([*panel[:2], goal[2]]), SLIM), goal[2]])
     room = -_offset(goal, panel).s - config.clearance
     if room < 0 and not drive.fixed:
         return _end(m, "failed", Verdict.REACH_LIMIT, f"the stance is {-room:.3f} m too near to the panel")
-    base = state.odometry[:3]
     at = _offset(base, goal)
     if m.phase != "settle":
         m = changed(m, quiet_since=time)  # stillness counts from there on
-    there = _pre_stance(config, goal)
-    if keep:
-        there = _round(base[:2], there, stem, keep)
     if m.phase == "plan":
         m = _plan(config, m, base, there, at, _ahead(panel, valve.marker.xyz[2] - valve.panel.depth), drive)
         if m.result == "failed":
@@ -377,9 +375,9 @@ def _fine(
     if m.phase == "settle":
         m, twist = _settle(config, m, time, dt, state, at, drive)
     elif drive.sideways:
-        near = _offset(base, panel).s + config.clearance > NEAR
-        beside = keep > 0 and (at.s > 0 or abs(at.e) > BESIDE * config.pre_stance)  # of the line in, at a post
-        m, twist = _go(config, drive, m, dt, base, there if near or beside else goal[:2], at, near or beside)
+        first = _offset(base, panel).s + config.clearance > NEAR  # away from the panel
+        first |= upright and (at.s > 0 or abs(at.e) > BESIDE * config.pre_stance)  # round the post to the line in
+        m, twist = _go(config, drive, m, dt, base, there if first else goal[:2], at, first)
     else:
         m, twist = PHASES[m.phase](config, m, dt, base, there, at)
     if m.result == "running":

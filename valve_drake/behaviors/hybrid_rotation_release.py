@@ -45,9 +45,8 @@ class Releasing(Hands):
         if m.stage == "open":
             wide = min(state.left_gripper, state.right_gripper) > OPEN * self.robot.opening
             if wide or time - m.since > OPENING:
-                m = changed(
-                    m, stage="retreat", since=time, start=m.X, behind=self._behind(m, self.robot.held(state.torso))
-                )
+                behind = self._behind(m, self.robot.held(state.torso))
+                m = changed(m, stage="retreat", since=time, start=m.X, behind=behind)
             return m, V, opened
         if m.stage == "retreat":
             m = self._draw_back(time, dt, m, state)

@@ -66,9 +66,8 @@ class Looks(Motion):
         first = X_OA if m.X_OA0 is None else m.X_OA0
         m = changed(m, phase="planning", X_OA0=first, X_OA=X_OA, counted=counted, covariance=fused.covariance)
         m = changed(m, p_OV=fused.X_OV[:, 3], plan=GraspPlan())  # what the hands did by it is counted
-        return self._ask(
-            m, "grasps", X_BA, posture=self.robot.held(inputs.state.torso), turn_angle=inputs.mode.turn_angle - counted
-        )
+        posture = self.robot.held(inputs.state.torso)
+        return self._ask(m, "grasps", X_BA, posture=posture, turn_angle=inputs.mode.turn_angle - counted)
 
     def _plan(self, time: float, m: Memory, grasps: GraspPlan) -> Memory:
         """Takes the grasps that were asked for."""

@@ -137,17 +137,16 @@ def reachable(config: ValveSearchConfig, limits: GazeLimits) -> tuple[ValveSearc
     A default is clipped; a value that was chosen is refused, by a ConfigError that names the key. A value that equals
     the default counts as one. A head without a tilt or a pan looks along its mount: one line says so.
     """
-    default, fitted, notes = ValveSearchConfig(), copy.deepcopy(config), []
-    for joint, limit, turn in ("tilt", limits.pitch, "looks at one height"), ("pan", limits.pan, "looks ahead"):
-        if limit is None:
-            notes.append(f"gaze.{joint}: none: the head does not turn, the search {turn}")
-    tilt, pan, waist = (limits.pitch is not None, limits.pan is not None, limits.waist is not None)
+    default, fitted = ValveSearchConfig(), copy.deepcopy(config)
+    ways = {"tilt": "up or down", "pan": "aside"}
+    lacks = {joint for joint, limit in (("tilt", limits.pitch), ("pan", limits.pan)) if limit is None}
+    notes = [f"gaze.{joint}: none: the head does not turn {ways[joint]}" for joint in ways if joint in lacks]
     pitch, yaw = limits.pitch or (0.0, 0.0), (0.0, limits.pan or 0.0)
-    asked = [("pitch_low", pitch, tilt), ("pitch_high", pitch, tilt), ("pitches", pitch, tilt)]
-    asked += [("yaw_limit", yaw, pan), ("sweep_yaw", yaw, pan)]
-    if waist:
-        asked.append(("sweep_waist", (0.0, limits.waist or 0.0), True))
-    for name, (low, high), told in asked:
+    asked = [("tilt", name, pitch) for name in ("pitch_low", "pitch_high", "pitches")]
+    asked += [("pan", name, yaw) for name in ("yaw_limit", "sweep_yaw")]
+    if limits.waist is not None:
+        asked.append(("waist", "sweep_waist", (0.0, limits.waist)))
+    for joint, name, (low, high) in asked:
         value = getattr(config, name)
         values = value if isinstance(value, list) else [value]
         clipped = [_within(one, low, high) for one in values]
@@ -157,7 +156,7 @@ def reachable(config: ValveSearchConfig, limits: GazeLimits) -> tuple[ValveSearc
         require(value == getattr(default, name), f"{config.KEY}.{name}", words, value)
         new = list(dict.fromkeys(clipped)) if isinstance(value, list) else clipped[0]  # no round twice
         setattr(fitted, name, new)
-        if told:
+        if joint not in lacks:
             notes.append(f"{config.KEY}.{name}: {_said(new)} instead of {_said(value)}: what the robot's joint can do")
     return fitted, notes
 
@@ -205,7 +204,7 @@ class Memory:
     confirm_left: int = 0  # pairs of images that a sighting may still be confirmed by
     seen_time: float = -np.inf  # capture time of the newest pair of images, whatever it shows [s]
     seen_azimuth: float = 0.0  # of the left camera's axis then, in O [rad]
-    seen: int = 0  # pairs of images in this sweep
+    looked: bool = False  # there was a pair of images in this sweep
     ignore_until: float = -np.inf  # capture time [s]
 
 
@@ -409,7 +408,7 @@ def _gaze(
     # The waist turns by what the neck cannot, but only while the arms are folded.
     beyond = waist + yaw - _within(waist + yaw, -config.sweep_yaw, config.sweep_yaw)
     twist = _within(beyond, -config.sweep_waist, config.sweep_waist) if driving else 0.0
-    return np.array([twist, *_neck(config, pitch, yaw)])
+    return np.array([twist, *neck(config, pitch, yaw)])
 
 
 def _out_of_reach(
@@ -422,7 +421,7 @@ def _out_of_reach(
     return abs(wrap(float(torso[0]) + yaw)) > config.yaw_limit + config.sweep_waist + sight.aside
 
 
-def _neck(config: ValveSearchConfig, pitch: float, yaw: float) -> tuple[float, float]:
+def neck(config: ValveSearchConfig, pitch: float, yaw: float) -> tuple[float, float]:
     """Neck pitch and yaw, clipped to the joints' limits."""
     return (
         _within(pitch, config.pitch_low, config.pitch_high),
@@ -464,8 +463,8 @@ def _search(
         m = changed(m, turn_rate=slew(m.turn_rate, 0.0, config.turn_acceleration * dt))
         if not m.looks:
             return m, m.goal
-        neck = aim(head_pose, base, m.goal, m.looks[-1][0])
-        return m, np.array([m.goal[0], *_neck(config, *neck)])
+        way = aim(head_pose, base, m.goal, m.looks[-1][0])
+        return m, np.array([m.goal[0], *neck(config, *way)])
     return _sweep(config, m, dt, float(base[2]), sweeps, sight)
 
 
@@ -474,7 +473,7 @@ def _look(config: ValveSearchConfig, m: Memory, time: float, position: StereoPos
     if position.time > m.seen_time:
         axis = position.X_OL[:, 2]
         azimuth, left = float(np.arctan2(axis[1], axis[0])), max(m.confirm_left - 1, 0)
-        m = changed(m, seen_time=position.time, seen_azimuth=azimuth, confirm_left=left, seen=m.seen + 1)
+        m = changed(m, seen_time=position.time, seen_azimuth=azimuth, confirm_left=left, looked=True)
     if not position.found or position.time <= max(m.capture_time, m.since, m.ignore_until):
         return m
     p_OV = apply(position.X_OL, position.p_LV)
@@ -514,11 +513,11 @@ def _sweep(
     m = changed(m, gaze=float(gaze))
     # It does not turn back before its images join those of the next sweep.
     unseen = m.side * wrap(heading + m.gaze - m.seen_azimuth)
-    if gaze == m.side * end and m.seen and unseen <= max(end + sight.aside - np.pi / round_, JOINS):
+    if gaze == m.side * end and m.looked and unseen <= max(end + sight.aside - np.pi / round_, JOINS):
         sweeps = m.sweeps + 1
         onward = m.side if sweeps % round_ % 2 else -m.side  # every turn of a round goes the same way
         turn = onward * 2 * np.pi / round_ + m.owed if sweeps % round_ else 0.0
-        m = changed(m, sweeps=sweeps, side=-m.side, to_turn=turn, owed=0.0, seen=0)
+        m = changed(m, sweeps=sweeps, side=-m.side, to_turn=turn, owed=0.0, looked=False)
         if sweeps == round_ * len(config.pitches):
             where = "all round" if round_ > 1 else "as far as the head turns"
             m = _end(m, "failed", Verdict.NOT_FOUND, f"no marker in {sweeps} sweeps {where}")

@@ -18,6 +18,7 @@ from valve_drake.messages import (
 )
 from valve_drake.ports import TICK, Block, Inputs, Outputs
 from valve_drake.robot.drive import DIFFERENTIAL, Drive
+from valve_drake.robot.gaze import Gaze
 
 
 class ValveSearchInputs(Inputs):
@@ -41,10 +42,8 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
     command      out  Command            torso always, base_twist in search
     status       out  Status
 
-    head_pose: base (x, y, heading) in O, torso (n,) -> X_OL (3, 4). rest: the torso's joints at home (n,). gaze: which
-    of them are waist, tilt and pan, of which tilt and pan come last; None: the robot has none, and its angle is 0. The
-    lift is driven to the stance's in fine_approach, and stays there. signs: of waist, tilt and pan: 1 for a joint that
-    turns it to the left, down, left as it grows (3,); None: all do.
+    head_pose: base (x, y, heading) in O, torso (n,) -> X_OL (3, 4). gaze: how the torso turns the eyes. The lift is
+    driven to the stance's in fine_approach, and stays there.
     look: where to look near the valve, off the marker's middle, in V (3,); None: at the marker. drive: of the base.
     sight: of the eyes.
     """
@@ -55,16 +54,14 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         self,
         config: ValveSearchConfig,
         head_pose: HeadPose,
-        rest: np.ndarray,
-        gaze: tuple[int | None, int | None, int | None],
-        signs: np.ndarray | None = None,
+        gaze: Gaze,
         look: np.ndarray | None = None,
         drive: Drive = DIFFERENTIAL,
         sight: Sight = USUAL,
         name: str = "valve_search",
     ):
         config.check()
-        self.config = config if gaze[0] is not None else dc.replace(config, sweep_waist=0.0)
+        self.config = config if gaze.joints[0] is not None else dc.replace(config, sweep_waist=0.0)
         if drive.fixed:
             self.config = bolted(self.config, sight)
         else:
@@ -74,10 +71,8 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
                 turn_speed=min(config.turn_speed, speed),
                 turn_acceleration=min(config.turn_acceleration, acceleration),
             )
-        self._rest, self._gaze, self._look, self._drive, self._sight = rest, gaze, look, drive, sight
-        self._held = len(rest) - sum(joint is not None for joint in gaze[1:])  # lift and waist
-        self._signs = np.ones(3) if signs is None else signs
-        self._plain = gaze == (0, 1, 2) and len(rest) == 3 and bool((self._signs > 0).all())  # the torso is the gaze
+        self._gaze, self._look, self._drive, self._sight = gaze, look, drive, sight
+        self._held, self._plain = gaze.held, gaze.plain
         self._whole_pose = head_pose
         super().__init__(name, period=2 * TICK)
 
@@ -88,11 +83,11 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
         stance = inputs.stance
         if inputs.mode.mode == Mode.FINE_APPROACH and stance.found and len(stance.posture) == self._held:
             memory = changed(memory, lift=stance.posture)
-        lift = self._rest[: self._held] if memory.lift is None else memory.lift
+        lift = self._gaze.rest[: self._held] if memory.lift is None else memory.lift
         measured = inputs.robot_state.torso
 
         def head_pose(base: np.ndarray, gaze: np.ndarray) -> np.ndarray:
-            return self._whole_pose(base, gaze if self._plain else self._torso(gaze, measured[: self._held]))
+            return self._whole_pose(base, gaze if self._plain else self._gaze.torso(gaze, measured[: self._held]))
 
         memory, command, status = step(
             self.config,
@@ -109,21 +104,9 @@ class ValveSearchSystem(Block[ValveSearchInputs, Memory]):
             self._sight,
         )
         if command.torso is not None and not self._plain:
-            command = dc.replace(command, torso=self._torso(command.torso, lift))
+            command = dc.replace(command, torso=self._gaze.torso(command.torso, lift))
         return memory, {"command": command, "status": status}
 
     def _seen(self, state: RobotState) -> RobotState:
         """The state with the gaze for its torso."""
-        if self._plain:
-            return state
-        gaze = [0.0 if joint is None else state.torso[joint] for joint in self._gaze]
-        return dc.replace(state, torso=self._signs * gaze)
-
-    def _torso(self, gaze: np.ndarray, posture: np.ndarray) -> np.ndarray:
-        """The torso's joints for waist, tilt and pan; posture: lift and waist, of which the lift counts."""
-        torso, gaze = self._rest.copy(), self._signs * gaze
-        torso[: len(posture)] = posture
-        for joint, angle in zip(self._gaze, gaze):
-            if joint is not None:
-                torso[joint] = angle
-        return torso
+        return state if self._plain else dc.replace(state, torso=self._gaze.of(state.torso))

@@ -11,16 +11,14 @@ from typing import NamedTuple
 import numpy as np
 
 from valve_drake import frames
-from valve_drake.perception.marker import Marker
+from valve_drake.perception.marker import MARK, Marker
 from valve_drake.perception.views import View
 
 _OFF = 0.12  # a spot so far from a mark's circle is another thing [radii]
 _ALIKE = 0.1  # marks that propose angles so near to each other agree: the marker's pose is as good as that [rad]
 _TOGETHER = 0.03  # the mean is of those that are so near to it [rad]
 _SPOT = 0.7  # standard deviation of a green spot's middle [px]
-# Half a mark along its handle and across it, and a pixel: what reaches beyond the image is cut off, and its middle is
-# another [m], [px].
-_HALF, _PIXEL = (0.020, 0.011), 2.0
+_EDGE = 2.0  # a mark that comes nearer to the image's border may be cut off, and then its middle is another [px]
 
 
 class MarkAngle(NamedTuple):
@@ -41,7 +39,8 @@ def mark_angle(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker, 
     marks, along = frames.apply(frames.inverse(marker.X_VA), marker.marks), marker.along @ marker.X_VA[:, :3]
     seen: list[tuple[float, float, tuple[int, int]]] = []  # angle, its variance, camera and mark
     for camera, view in enumerate(views):
-        X_AC = frames.inverse(frames.compose(view.X_CL, X_LA))
+        X_CA = frames.compose(view.X_CL, X_LA)
+        X_AC = frames.inverse(X_CA)
         rays = np.column_stack([view.green, np.ones(len(view.green))]) @ X_AC[:, :3].T
         for k, mark in enumerate(marks):
             radius, at = math.hypot(mark[0], mark[1]), math.atan2(mark[1], mark[0])
@@ -52,7 +51,7 @@ def mark_angle(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker, 
                 if scale <= 0 or abs(math.hypot(x, y) / radius - 1) >= _OFF:
                     continue
                 angle = at - math.atan2(y, x)
-                if _whole(frames.rot_z(-angle) @ along[k], np.array([x, y, mark[2]]), X_AC, view.focal, room):
+                if _whole(frames.rot_z(-angle) @ along[k], np.array([x, y, mark[2]]), X_CA, view.focal, room):
                     sigma = _SPOT / view.focal * scale / radius
                     seen.append((frames.wrap(angle), sigma**2, (camera, k)))
     if not seen:
@@ -76,11 +75,11 @@ def mark_angle(views: list[View], R: np.ndarray, p: np.ndarray, marker: Marker, 
     return MarkAngle(float(angles[best]) + mean + 2 * math.pi * turns, sigma, most)
 
 
-def _whole(along: np.ndarray, middle: np.ndarray, X_AC: np.ndarray, focal: float, room: np.ndarray) -> bool:
+def _whole(along: np.ndarray, middle: np.ndarray, X_CA: np.ndarray, focal: float, room: np.ndarray) -> bool:
     """Whether a mark at `middle`, its longer side `along`, both in A, is in the image whole. room: see View."""
-    across = np.array([-along[1], along[0], 0.0])
-    corners = [middle + i * _HALF[0] * along + k * _HALF[1] * across for i in (-1, 1) for k in (-1, 1)]
-    P = frames.apply(frames.inverse(X_AC), np.array([middle, *corners]))
+    length, width = MARK[0] * along, MARK[1] * np.array([-along[1], along[0], 0.0])
+    corners = [middle + i * length + k * width for i in (-0.5, 0.5) for k in (-0.5, 0.5)]
+    P = frames.apply(X_CA, np.array([middle, *corners]))
     px = focal * P[:, :2] / P[:, 2:]
     off = px[1:] - px[0]
-    return bool((np.concatenate([-off.min(0), off.max(0)]) + _PIXEL < room).all())
+    return bool((np.concatenate([-off.min(0), off.max(0)]) + _EDGE < room).all())

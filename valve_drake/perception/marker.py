@@ -12,6 +12,7 @@ from valve_drake.frames import apply, inverse
 # Corners of the unit rectangle in V in their one order: clockwise as the camera sees them (V's z points into the
 # panel). Side k joins corner k and corner k + 1: side 0 is y = -Y_w, 1 is x = +X_w, 2 is y = +Y_w, 3 is x = -X_w.
 NEXT = [1, 2, 3, 0]
+MARK = (0.040, 0.022)  # a green mark: along its handle, across it [m]
 MARKS = np.array([[0.15, 0.0, 0.028], [-0.15, 0.0, 0.028]])  # of our valve, in V [m]
 _UNIT_CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
 

@@ -34,6 +34,7 @@ from valve_drake.robot import description as descriptions
 from valve_drake.robot import kinematics
 from valve_drake.robot.description import FAR, TORQUE, RobotDescription
 from valve_drake.robot.drive import Drive, drive
+from valve_drake.robot.gaze import Gaze
 from valve_drake.robot.groups import Groups
 from valve_drake.robot.kinematics import Arm, HandLoad, Joints
 from valve_drake.robot.model import (
@@ -132,7 +133,7 @@ class Robot:
     arms: Mapping[str, Arm]
     hands: Mapping[str, HandLoad]
     grippers: Mapping[str, Gripper]
-    gaze_signs: np.ndarray  # of waist, tilt, pan: 1 where it turns the eye to the left, down, left as it grows (3,)
+    gaze: Gaze
     opening: float  # of an open gripper [m]
     home: np.ndarray  # both arms, left first (n + m,)
     couples: bool  # joints that follow others carry hands or eyes, as the second stage of a lift does
@@ -184,7 +185,7 @@ class Robot:
         self.follow(q)
         self._home_q = q
         ways = [self._eye, *(frame_named(plant, index, f"{side}_grip", f"frames.{side}_grip") for side in SIDES)]
-        carrying = {inner.name() for way in ways for inner in _carriers(plant, index, way)}
+        carrying = {inner.name() for way in ways for inner in carriers(plant, index, way)}
         self.couples = any(mimic.joint in carrying for mimic in model.mimics)
         self._chains = {side: self._chain(side, joint) for side in SIDES}
         self._plant.SetPositions(self._context, self._home_q)
@@ -192,7 +193,7 @@ class Robot:
         self._check_sides()
         self._check_posture()
         self._check_ahead()
-        self.gaze_signs = _locked(self._gaze_signs())
+        self.gaze = self._gaze()
         self.grippers = MappingProxyType({side: self._gripper(side, joint[f"grippers.{side}.joint"]) for side in SIDES})
         for side in SIDES:
             q[joint[f"grippers.{side}.joint"].position_start()] = self.grippers[side].position(d.opening)
@@ -210,13 +211,6 @@ class Robot:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Robot":
         return self
-
-    @property
-    def gaze(self) -> tuple[int | None, int | None, int | None]:
-        """Which of the torso's joints are waist, tilt and pan; None: the robot has none."""
-        names, d = self.torso.names, self.description.gaze
-        waist, tilt, pan = (names.index(name) if name else None for name in (d.waist, d.tilt, d.pan))
-        return waist, tilt, pan
 
     def held(self, torso: np.ndarray) -> np.ndarray:
         """See RobotKinematics."""
@@ -461,7 +455,7 @@ class Robot:
         plant, index = self._plant, self.model.robot
         grip = frame_named(plant, index, f"{side}_grip", f"frames.{side}_grip")
         joints = [joint[f"arms.{side}.joints[{k}]"] for k in range(len(self.arms[side]))]
-        carried = _carriers(plant, index, grip)
+        carried = carriers(plant, index, grip)
         for k, inner in enumerate(joints):
             if inner not in carried:
                 raise ConfigError(f"arms.{side}.joints[{k}] must carry {side}_grip, got {shown(inner.name())}")
@@ -517,11 +511,11 @@ class Robot:
 
     def _check_posture(self) -> None:
         """What holds still while the hands work carries them: lift and waist."""
-        keys = [f"lift.joints[{k}]" for k in range(self.lift)] + ["gaze.waist"] * (self.gaze[0] is not None)
+        keys = [f"lift.joints[{k}]" for k in range(self.lift)] + ["gaze.waist"] * bool(self.description.gaze.waist)
         for key, name in zip(keys, self.posture.names):
             for side in SIDES:
                 shoulder = self._chains[side].shoulder
-                carried = [joint.name() for joint in _carriers(self._plant, self.model.robot, shoulder)]
+                carried = [joint.name() for joint in carriers(self._plant, self.model.robot, shoulder)]
                 require(name in carried, key, "a joint that carries both arms", name)
 
     def _check_ahead(self) -> None:
@@ -531,20 +525,21 @@ class Robot:
         words = f"a joint, or the left eye has to look ahead within {_AHEAD:g} rad; it looks {aside:.2f} rad left"
         require(bool(self.description.gaze.pan) or abs(aside) < _AHEAD, "gaze.pan", words, "")
 
-    def _gaze_signs(self) -> np.ndarray:
-        """Read off the model by how the eye's axis moves; 1 for a joint that the robot lacks."""
-        d, signs = self.description.gaze, [1.0, 1.0, 1.0]
+    def _gaze(self) -> Gaze:
+        """Its signs are read off the model by how the eye's axis moves; 1 for a joint that the robot lacks."""
+        d, signs, joints = self.description.gaze, [1.0, 1.0, 1.0], list[int | None]([None] * 3)
         aside = "to the left and right"
         ways = ("waist", 1, 1.0, aside), ("tilt", 2, -1.0, "up and down"), ("pan", 1, 1.0, aside)
         for k, (key, row, sign, words) in enumerate(ways):
             if not (name := getattr(d, key)):
                 continue
-            torso = self.torso.home.copy()
-            torso[self.torso.names.index(name)] += 0.1
+            torso, joints[k] = self.torso.home.copy(), self.torso.names.index(name)
+            torso[joints[k]] += 0.1
             moved = sign * (self.X_BL(torso)[row, 2] - self.X_BL(self.torso.home)[row, 2])
             require(abs(moved) > 0.01, f"gaze.{key}", f"a joint that turns the eye {words}", name)
             signs[k] = math.copysign(1.0, moved)
-        return np.array(signs)
+        waist, tilt, pan = joints
+        return Gaze((waist, tilt, pan), self.torso.home, _locked(np.array(signs)))
 
     def _gripper(self, side: str, joint: Joint) -> Gripper:
         """Opening over position, from the pads' distance along the closing direction; shut is the least."""
@@ -583,7 +578,7 @@ class Robot:
         if name == TORQUE:  # the model bears the weight, and the wrench is that at the grip point
             return HandLoad(0.0, _locked(np.zeros(3)), _locked(np.eye(3, 4)))
         sensor = joint_named(plant, index, name, key)
-        carried = _carriers(plant, index, chain.grip)
+        carried = carriers(plant, index, chain.grip)
         last = self.arms[side].names[-1]
         beyond = sensor in carried and any(joint.name() == last for joint in carried[carried.index(sensor) :])
         good = sensor.type_name() == "weld" and beyond
@@ -599,7 +594,7 @@ class Robot:
         bodies = [plant.get_body(i) for i in plant.GetBodyIndices(index)]
         mass, moment = 0.0, np.zeros(3)
         for body in bodies:
-            if sensor in _carriers(plant, index, body.body_frame()):
+            if sensor in carriers(plant, index, body.body_frame()):
                 own = body.default_mass()
                 com = body.CalcCenterOfMassInBodyFrame(self._context)
                 mass += own
@@ -694,7 +689,7 @@ def _arm(d: RobotDescription, side: str, joint: Mapping[str, Joint]) -> Arm:
     return arm
 
 
-def _carriers(plant: MultibodyPlant, index: ModelInstanceIndex, frame: Frame) -> list[Joint]:
+def carriers(plant: MultibodyPlant, index: ModelInstanceIndex, frame: Frame) -> list[Joint]:
     """The joints that carry a frame, the nearest first."""
     out: list[Joint] = []
     body = frame.body()

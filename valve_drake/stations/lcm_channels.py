@@ -312,8 +312,8 @@ IMAGES = {camera: CHANNELS[f"{camera}.image"] for camera in CAMERAS}
 
 
 def present(rows: Iterable[Channel], groups: Groups) -> tuple[Channel, ...]:
-    """Those of the devices that a robot has: a fixed base, a torso without joints and a hand
-    without a force sensor say and hear nothing."""
+    """Those of the devices that a robot has: a fixed base, a torso without joints and a hand without a force sensor
+    say and hear nothing."""
     return tuple(row for row in rows if row.device not in groups.absent)
 
 

@@ -24,6 +24,7 @@ from pydrake.multibody.tree import (
 from valve_drake import resources
 from valve_drake.checks import ConfigError, require
 from valve_drake.frames import compose, inverse, make, rot_z
+from valve_drake.perception import marker
 from valve_drake.robot.description import find_package_file
 from valve_drake.robot.model import frame_named, joint_named, parent_joint, parse
 from valve_drake.valve.valve import PLATE, SPOKE, Valve
@@ -32,7 +33,7 @@ RED, GREEN = (0.80, 0.06, 0.05, 1.0), (0.05, 0.55, 0.15, 1.0)
 STEEL, DARK = (0.70, 0.71, 0.73, 1.0), (0.08, 0.085, 0.095, 1.0)
 FACE, ENAMEL = (0.78, 0.78, 0.77, 1.0), (0.52, 0.56, 0.61, 1.0)
 STICKER = 1e-5  # thickness of the marker: a plate would show its rim to a camera from above [m]
-MARK = (0.040, 0.022, 0.001)  # a green mark: along its handle, across it, thick [m]
+MARK = (*marker.MARK, 0.001)  # a green mark: along its handle, across it, thick [m]
 FRICTION, STIFFNESS, DISSIPATION = 0.8, 5e4, 5.0  # of a handle under a pad [-, N/m, s/m]
 TORQUE = 5.1  # effort limit of the stem's friction until a scene sets it [N m]
 CLEARLY = 0.02  # spokes that are so much farther from the handles are worth another place [rad]
