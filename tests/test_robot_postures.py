@@ -86,7 +86,7 @@ def test_check_robot_tells_postures_where_those_of_the_file_do_not_serve(robot):
     scenario, report = scenarios.load(None, []), Report("", "")
     report.reach.append(Reach(1.0, 0.0, -1.0))
     report.hidden = {"left": 0.0}
-    robot_check._postures(report, robot, scenario, CollisionModel(robot))
+    robot_check._postures(report, robot, scenario, CollisionModel(robot), robot_check._head_of(scenario))
     told = {finding.key: finding.text for finding in report.findings if finding.level == NOTE}
     assert set(told) == {f"arms.{side}.{key}" for side in SIDES for key in ("work", "home")}
     assert "is turned with a margin of" in told["arms.left.work"] and told["arms.left.home"].startswith("try [")
@@ -98,5 +98,6 @@ def test_check_robot_tells_none_where_those_of_the_file_serve():
     report = Report("", "")
     report.reach.append(Reach(1.0, 0.0, 0.9))
     report.hidden = {"left": 0.0}
-    robot_check._postures(report, ours, scenarios.load(None, []), CollisionModel(ours))
+    scenario = scenarios.load(None, [])
+    robot_check._postures(report, ours, scenario, CollisionModel(ours), robot_check._head_of(scenario))
     assert not report.findings
