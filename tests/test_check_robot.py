@@ -174,13 +174,22 @@ def test_a_head_that_does_not_turn_sees_valves_of_some_heights_from_the_stance(t
     path = variant(tmp_path, lambda model: stiff_neck(model, 0.6), without_gaze)
     report = checked(path, "simulation.valve.height=!Uniform {min: 0.9, max: 1.3}")
     upright = {row.height: row for row in report.reach if row.tilt == 0}
-    assert upright[1.0].seen_to < 2 and np.isnan(upright[0.8].seen_to) and np.isnan(upright[1.3].seen_to)
+    assert 0 < upright[1.0].seen_to < 2 and upright[0.8].seen_to == 0 and upright[1.3].seen_to == 0
     assert any("gaze.tilt: the eyes do not see the whole marker" in line for line in said(report, DOUBTFUL))
     assert any("m from there back to 2 m" in finding.text for finding in report.findings)
     low = checked(path, "simulation.valve.height=0.75")
     assert any("at 0.75" in line and "from where its hands reach it" in line for line in said(low, MISSING))
     ours = checked("robot/robot.yaml")
     assert all(row.seen_to == 4.0 for row in ours.reach) and not said(ours, DOUBTFUL)
+
+
+@pytest.mark.system
+def test_a_fixed_robot_is_shown_before_the_valve_and_one_without_a_calibration_is_not_said_to_see_nothing(tmp_path):
+    path = variant(tmp_path, without_base_joints, lambda given: (fixed(given), given.pop("head_calibration")))
+    report = checked(path, pictures=True)
+    assert any(title.startswith("at a valve") for title in report.pictures)
+    assert all(row.seen_to is None for row in report.reach)
+    assert "not seen" not in robot_check_page.page(report)
 
 
 @pytest.mark.system

@@ -97,7 +97,7 @@ class Reach:
     posture: tuple[float, ...] = ()  # lift and waist
     effort: float = math.nan  # largest share of a joint's limit
     joint: str = ""  # whose that is
-    seen_to: float = math.nan  # the head sees the valve from there, and as far back as this [m]; NaN: not from there
+    seen_to: float | None = None  # the head sees the valve from there to so far back [m]; 0: not; None: no calibration
 
     def serves(self, least: float) -> bool:
         return self.margin >= least and not self.effort > DEAR
@@ -490,7 +490,7 @@ def _reach(
         effort, joint = _effort(report, robot, stances, X_BA, place)
         distance = float(np.linalg.norm(place.base[:2]))
         posture = () if place.posture is None else tuple(round(float(q), 4) for q in place.posture)
-        seen_to = math.nan if head is None else seen_from(robot, head, search, place, _marker(scenario.valve, X_WA))
+        seen_to = None if head is None else seen_from(robot, head, search, place, _marker(scenario.valve, X_WA))
         report.reach.append(Reach(height, tilt, margin, distance, posture, effort, joint, seen_to))
         if tilt == 0 and (best is None or margin > best[0]):
             best = margin, valve, place
@@ -583,8 +583,8 @@ def _judge_sight(report: Report, scenario: Scenario, own: set[float], drives: bo
     """Whether the head sees the valves that the hands reach: from the stance, and on the way there."""
     good = [row for row in report.reach if row.tilt == 0 and row.serves(scenario.stance.margin_min)]
     comes = scenario.base_approach.rough_distance
-    blind = [row for row in good if math.isnan(row.seen_to)]
-    late = [row for row in good if drives and row.seen_to < comes]
+    blind = [row for row in good if row.seen_to == 0]
+    late = [row for row in good if drives and row.seen_to and row.seen_to < comes]
     for rows, where in (blind, "from where its hands reach it"), (late, f"from there back to {comes:g} m"):
         if not rows:
             continue
@@ -758,23 +758,24 @@ def _pictures(
     d = robot.description
     valve, place = best if best is not None else (ValveConfig(), Place(np.array([-1.0, 0, 0])))
 
-    def add(plant: MultibodyPlant) -> ModelInstanceIndex:
-        return add_scene(plant, valve, scenario.valve, d, laboratory=False).robot
+    def pose(base: np.ndarray, torso: np.ndarray, arms: Mapping[str, np.ndarray]) -> Studio:
+        """A fixed base is bolted down there, another is put there by its joints."""
+        studio = Studio(lambda plant: add_scene(plant, valve, scenario.valve, d, base.tolist(), laboratory=False).robot)
+        moved = {"base": base} if len(robot.base) else {}
+        studio.pose(robot.named(torso=torso, arms=arms, opening=robot.opening, **moved))
+        return studio
 
-    studio = Studio(add)
     arms = {side: arm.home for side, arm in robot.arms.items()}
     away = np.array([-2.0, 0.0, 0.0])
-    base = {"base": away} if len(robot.base) else {}
-    studio.pose(robot.named(torso=robot.torso.home, arms=arms, opening=robot.opening, **base))
-    ground = np.array([away[0], away[1], 0.0]) if base else np.zeros(3)
-    box = np.array([[-0.5, -0.6, 0.0], [0.6, 0.6, 1.6]]) + ground
+    studio = pose(away, robot.torso.home, arms)
+    box = np.array([[-0.5, -0.6, 0.0], [0.6, 0.6, 1.6]]) + away
     report.pictures["at home"] = png(studio.around(box))
     looks = _gaze(robot, scenario.valve_search.pitches[0], 0.0)
-    studio.pose(robot.named(torso=looks, arms=arms, opening=robot.opening, **base))
+    studio = pose(away, looks, arms)
     for eye, X_LC in eyes.items():
         X = compose(studio.frame(d.cameras["head_left"]), X_LC)
         report.pictures[f"{eye} eye, arms folded, a valve 2 m away"] = png(studio.view(X, _info(head, eye)))
-    if best is None or not len(robot.base):
+    if best is None:
         return
     X_WA = compose(panel_pose(valve), inverse(scenario.valve.X_AP()))
     stances = _stances(robot, scenario, CollisionModel(robot))
@@ -782,7 +783,7 @@ def _pictures(
     torso = robot.torso.home.copy()
     if place.posture is not None:
         torso[: len(place.posture)] = place.posture
-    studio.pose(robot.named(base=place.base, torso=torso, arms=arc.q, opening=robot.opening))
+    studio = pose(place.base, torso, arc.q)
     box = np.array([[place.base[0] - 0.4, -0.6, 0.0], [0.1, 0.6, 1.6]])
     report.pictures[f"at a valve {valve.height:g} m high"] = png(studio.around(box, BEHIND))
 

@@ -94,7 +94,7 @@ def _reach_row(row: Reach) -> tuple[str, ...]:
         return (*place, "-", "out of reach", "", "", "", "")
     effort = "" if math.isnan(row.effort) else f"{row.effort:.2f}"
     posture = ", ".join(f"{q:g}" for q in row.posture) or "home"
-    seen = "not seen" if math.isnan(row.seen_to) else f"{row.seen_to:.2f}"
+    seen = "" if row.seen_to is None else f"{row.seen_to:.2f}" if row.seen_to else "not seen"
     return (*place, f"{row.margin:.2f}", f"{row.distance:.2f}", seen, posture, effort, row.joint)
 
 
@@ -134,7 +134,7 @@ def _sections(report: Report) -> Iterator[str]:
     yield (
         "<p class='note'>The best place for each height and tilt of the panel. margin: of the arms from their limits "
         f"and singular postures, 1 is comfortable, {report.least_margin:g} is needed; effort: the largest share of a "
-        "joint's limit, by weight and push.</p>"
+        "joint's limit, by weight and push; seen to: how far back from there both eyes see the whole marker.</p>"
     )
     table = "".join(_reach_cells(row, report.least_margin) for row in report.reach)
     yield f"<table><tr>{_cells(_reach_head(report), 'th')}</tr>{table}</table>"
@@ -158,7 +158,8 @@ def _sections(report: Report) -> Iterator[str]:
 
 
 def _reach_cells(row: Reach, least: float) -> str:
-    shade = "#f6e3e1" if not row.serves(least) else f"hsl(130 45% {94 - 24 * max(row.margin, 0):.0f}%)"
+    serves = row.serves(least) and row.seen_to != 0
+    shade = f"hsl(130 45% {94 - 24 * max(row.margin, 0):.0f}%)" if serves else "#f6e3e1"
     cells = "".join(f"<td class='cell'>{html.escape(cell)}</td>" for cell in _reach_row(row))
     return f"<tr style='background: {shade}'>{cells}</tr>"
 

@@ -1,7 +1,5 @@
 """From where a robot's head sees a valve, for `check-robot`: the gaze as it is led in a run, both eyes' images."""
 
-import math
-
 import numpy as np
 
 from valve_drake.behaviors.stance_search import Place
@@ -50,11 +48,11 @@ def seen_from(
     points: np.ndarray,
 ) -> float:
     """From a stance (the panel at the origin) straight back, how far the head sees `points` (n, 3) without a gap, base
-    to panel [m]; NaN where it does not see them from the stance. A fixed robot stays there."""
+    to panel [m]; 0 where it does not see them from the stance. A fixed robot stays there."""
     base, posture = place.base, robot.posture.home if place.posture is None else place.posture
     near = float(np.linalg.norm(base[:2]))
     if not sees(robot, head, search, base, posture, points):
-        return math.nan
+        return 0.0
     far = near
     if not robot.drive.fixed:
         for distance in (d for d in FAR if d > near):
